@@ -119,6 +119,13 @@ class SamplingConfig:
         high=2.0,
         choices=('auto', 'stamp', 'sight'),
     )
+    box_extents: str = setting(
+        'auto',
+        'what the input boxes hold: the whole object, or what is visible of it, as those of '
+        'clusters do, which are lengthened away from the sensor to the extents of their track; '
+        'found by their points (auto)',
+        choices=('auto', 'whole', 'visible'),
+    )
     points: int = setting(128, 'maximum number of points per box', '', 8, 100000)
 
 

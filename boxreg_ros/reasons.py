@@ -237,6 +237,12 @@ class Reason(StrEnum):
         'its boxes are late, or early, and were moved to where their objects are at their stamp',
         'correct their stamps where they are made, or set `sampling.box_time`',
     )
+    VISIBLE_BOXES = _reason(
+        'message',
+        'its boxes hold what is seen of their objects, as those of clusters, and were lengthened '
+        'away from the sensor to the extents that their tracks have shown',
+        'publish boxes of whole objects; if they are, set `sampling.box_extents` to `whole`',
+    )
     LATE = _reason(
         'box',
         'arrived after boxes with a younger stamp',

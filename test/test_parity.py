@@ -76,20 +76,24 @@ def as_rows(messages, type_name, frame='odom'):
     return np.hstack([boxes[:, :3], quaternions_of(boxes), boxes[:, 3:6]])
 
 
-@pytest.mark.parametrize('recording', ['vision-tf', 'markers-odometry', 'street'])
+@pytest.mark.parametrize(
+    'recording', ['vision-tf', 'vision-visible', 'markers-odometry', 'street']
+)
 def test_final_boxes_equal_those_of_relabel(tmp_path, recording):
     if recording == 'street':
         path, boxes_topic = ROOT / 'bags' / 'street.mcap', '/detections'
-        late = {}
+        changes = {}
     else:
         boxes, motion = recording.split('-')
-        late = {'sampling.box_time': 0.15} if boxes == 'markers' else {}
+        changes = {'sampling.box_time': 0.15} if boxes == 'markers' else {}
+        if motion == 'visible':
+            motion, changes = 'tf', {'sampling.box_extents': 'visible'}
         path = Drive(sweeps=10, boxes=boxes, motion=motion).write(tmp_path / 'drive')
         boxes_topic = '/boxes'
-    expected = relabelled(path, tmp_path / 'out', *(f'--set={k}={v}' for k, v in late.items()))
+    expected = relabelled(path, tmp_path / 'out', *(f'--set={k}={v}' for k, v in changes.items()))
     records = records_of(path, boxes_topic)
     (type_name,) = {record.type_name for record in records if record.topic == boxes_topic}
-    parameters = [f'{key}:={value}' for key, value in late.items()]
+    parameters = [f'{key}:={value}' for key, value in changes.items()]
     final = final_of_node(tmp_path, records, *parameters, boxes=(type_name, boxes_topic))
     # Boxes that the node held when it received the signal are included.
     assert_equal_boxes(as_published(final, type_name), expected)

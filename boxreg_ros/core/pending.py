@@ -7,6 +7,7 @@ They refer to each other: an estimate of a track is written to the box arrays of
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -20,9 +21,12 @@ from boxreg_ros.core.motion import motion_at
 from boxreg_ros.core.observation import Observation
 from boxreg_ros.core.support import points_to_confirm
 from boxreg_ros.core.tables import rows_of
+from boxreg_ros.core.visible_boxes import HELD_EXTENTS, lengthened, whole_extents
 from boxreg_ros.core.window import Estimate, Estimates, MarginalisationPrior, PRIOR_POSES
 from boxreg_ros.reasons import Reason
 from boxreg_ros.structures import (
+    BOX_CENTER,
+    BOX_EXTENT,
     BoxArray,
     COASTED,
     Floats,
@@ -118,6 +122,12 @@ class PendingArray:
             self.observed[one.row] = one
             one.array = self
             one.place = place
+
+    def lengthen(self, one: PendingBox) -> None:
+        """Let a box of the array be the one to register, and to return if it is kept."""
+        boxes = self.input.boxes.copy()
+        boxes[one.row] = one.box
+        self.input = replace(self.input, boxes=boxes)
 
     def add_predicted(self, track: ObservedTrack, one: PendingBox) -> None:
         """Add the predicted box of a track as a row."""
@@ -220,6 +230,14 @@ class PendingBox:
     estimate: tuple[Estimates, int] | None = None
     """Estimates of the windows that it was last in, and its row there."""
     is_settled: bool = False
+    given: Floats | None = None
+    """(9,), before it was lengthened; None if it was not."""
+
+    @property
+    def is_pinned(self) -> bool:
+        """Return whether a person has corrected the box."""
+        pinned = self.array.input.pinned
+        return pinned is not None and bool(pinned[self.row])
 
     def settle(self) -> None:
         """Let the estimate in the box array change no more."""
@@ -246,6 +264,10 @@ class ObservedTrack:
     """Stamp of the last detection [ns]."""
     least_points: float = inf
     """Points inside a predicted box that confirm it, known after the first missed detection."""
+    extents: deque[Floats] = field(default_factory=lambda: deque(maxlen=HELD_EXTENTS))
+    """(3,) of each box, where boxes hold what is seen of their objects [m]."""
+    whole_extents: Floats | None = None
+    """(3,), what these show of the object [m]."""
 
     @property
     def newest_ns(self) -> int:
@@ -256,6 +278,41 @@ class ObservedTrack:
         """Add the newest observation."""
         self.entries.append(one)
         self.seen.append(observation)
+
+    def begin_lengthening(self) -> None:
+        """Lengthen boxes that were not known to hold what is seen of their object."""
+        for entry in self.entries:
+            if not (entry.is_predicted or entry.is_pinned):
+                entry.given = entry.box
+                self.extents.append(entry.box[BOX_EXTENT])
+        if self.extents:
+            self._lengthen(whole_extents(self.extents, None))
+
+    def shown_extents(self, box: Floats) -> Floats:
+        """Return what the boxes up to a visible one show of the extents of the object [m]."""
+        self.extents.append(box[BOX_EXTENT])
+        whole = whole_extents(self.extents, self.whole_extents)
+        if whole is not self.whole_extents:
+            self._lengthen(whole)
+        return whole
+
+    def _lengthen(self, whole: Floats) -> None:
+        """Give the boxes whose observations are held the extents of the object."""
+        self.whole_extents, self.prior = whole, None
+        self.starts = [*self.starts]
+        for row, (entry, old) in enumerate(zip(self.entries, self.seen, strict=True)):
+            if entry.given is None:
+                continue
+            sensor = old.box[BOX_CENTER] + old.table.origins[old.row, 0]
+            box = _lengthened(entry.given, whole, sensor)
+            shift = old.box[None, BOX_CENTER] - box[BOX_CENTER]
+            alone = old.table.take(np.array([old.row]))
+            self.seen[row] = Observation(alone.relative_to(box[None], shift), 0)
+            entry.box, entry.place = box, box[: HEIGHT + 1].tolist()
+            if not entry.is_settled:
+                entry.array.lengthen(entry)
+            if row < len(self.starts):
+                self.starts[row] = _lengthened(self.starts[row], whole, sensor)
 
     def is_in(self, array: PendingArray) -> bool:
         """Return whether the newest observation is of `array`."""
@@ -349,3 +406,10 @@ class ObservedTrack:
         for row, entry in enumerate(entries, begin):
             if not entry.is_settled:
                 entry.estimate = table, row
+
+
+def _lengthened(box: Floats, extents: Floats, sensor: Floats) -> Floats:
+    """Return a box (9,) with the extents (3,) of its object, seen from a position (3,)."""
+    (found,) = lengthened(box[None], extents[None], (sensor - box[BOX_CENTER])[None])
+    whole: Floats = found
+    return whole

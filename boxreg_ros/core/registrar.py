@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, takewhile
 from math import ceil, inf
@@ -23,6 +24,7 @@ from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox, res
 from boxreg_ros.core.problem import settings_of_kinds
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import by_table
+from boxreg_ros.core.visible_boxes import lengthened, VisibleBoxes
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason
@@ -107,6 +109,8 @@ class BoxRegistrar:
         Sweeps and boxes added, boxes by status, and everything dropped or kept, by reason.
     box_time : BoxTimeEvidence
         Evidence of the time that the input boxes are of.
+    visible_boxes : VisibleBoxes
+        Evidence that the input boxes hold what is seen of their objects.
     followed : FollowedObjects
         Objects that are followed from one box each, see `follow`.
     publish : callable or None
@@ -173,10 +177,11 @@ class BoxRegistrar:
         self._constants = constants
         self._prepare = prepare
         self._correction = LatencyCorrection(config.estimate == 'track', latency)
+        self.visible_boxes = VisibleBoxes(config)
         self.reset()
 
     def reset(self) -> None:
-        """Discard tracks and box arrays that are held; keep the counts, and the latency."""
+        """Discard tracks and box arrays that are held; keep the counts, and what boxes are."""
         config = self.config
         self._correction.restart()
         self._matcher = StampMatcher(config, self.counts)
@@ -468,14 +473,10 @@ class BoxRegistrar:
 
     def _observe(self, array: PendingArray, sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
+        given = self._given(array)
+        if self.visible_boxes.are_found:
+            _lengthen(array, given, sweep)
         boxes = array.input
-        given = []
-        for row, track_id in enumerate(boxes.track_ids):
-            if not array.reasons[row]:
-                if track_id not in self._tracks:
-                    self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
-                one = PendingBox(boxes.stamp_ns, boxes.boxes[row], row)
-                given.append((self._tracks[track_id], one))
         coasting = [*self._followed(array, sweep), *self._coasting(array)]
         if not (given or coasting):
             return
@@ -491,6 +492,7 @@ class BoxRegistrar:
         for track, one in confirmed:
             array.add_predicted(track, one)
         array.observe([one for _, one in (*given, *confirmed)], seen)
+        track_ids = [track.track_id for track, _ in given]
         for (track, one), observation in zip(given, seen, strict=False):
             track.add(one, observation)
             track.detected_ns = boxes.stamp_ns
@@ -500,6 +502,21 @@ class BoxRegistrar:
                 self._tracks[track.track_id] = successor
         for (track, one), observation in zip(confirmed, seen[len(given) :], strict=True):
             track.add(one, observation)
+        if self.visible_boxes.add(track_ids, seen[: len(given)]):
+            for track in (*self._ended_tracks, *self._tracks.values()):
+                track.begin_lengthening()
+
+    def _given(self, array: PendingArray) -> list[_OfTrack]:
+        """Return the boxes that have no reason not to be refined."""
+        boxes = array.input
+        given = []
+        for row, track_id in enumerate(boxes.track_ids):
+            if not array.reasons[row]:
+                if track_id not in self._tracks:
+                    self._tracks[track_id] = ObservedTrack(track_id, boxes.class_names[row])
+                one = PendingBox(boxes.stamp_ns, boxes.boxes[row], row)
+                given.append((self._tracks[track_id], one))
+        return given
 
     def _followed(self, array: PendingArray, sweep: Sweep) -> list[_OfTrack]:
         """Return the boxes of followed objects that have none in `array`."""
@@ -682,6 +699,22 @@ class BoxRegistrar:
         ready = self._ready
         self._ready = []
         return ready
+
+
+def _lengthen(array: PendingArray, given: list[_OfTrack], sweep: Sweep) -> None:
+    """Give boxes that hold what is seen of their objects the extents that their tracks have."""
+    pinned = array.input.pinned
+    lengthening = [pair for pair in given if pinned is None or not pinned[pair[1].row]]
+    if not lengthening:
+        return
+    boxes = np.array([one.box for _, one in lengthening])
+    extents = np.array([track.shown_extents(one.box) for track, one in lengthening])
+    whole = array.input.boxes.copy()
+    rows = [one.row for _, one in lengthening]
+    whole[rows] = lengthened(boxes, extents, sweep.origin - boxes[:, : Z + 1])
+    array.input = replace(array.input, boxes=whole)
+    for _, one in lengthening:
+        one.given, one.box = one.box, whole[one.row]
 
 
 def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:

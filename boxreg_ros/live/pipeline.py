@@ -86,7 +86,7 @@ class MessagePipeline:
         self.wait = wait
         self._report = report
         submit, windows = (None, None) if budget is None else (budget.submit, budget.windows)
-        self.registrar = BoxRegistrar(config, submit, windows, drives, prepare=self._note_latency)
+        self.registrar = BoxRegistrar(config, submit, windows, drives, prepare=self._note_faults)
         # That of the newest boxes, for reports of another thread: the registrar estimates it anew
         # when it is read.
         self._latency = self.registrar.latency
@@ -340,10 +340,12 @@ class MessagePipeline:
         self._tickets.restart()
         self.following.restart()
 
-    def _note_latency(self, pair: Pair) -> BoxArray:
-        """Report boxes that were late, and return them."""
+    def _note_faults(self, pair: Pair) -> BoxArray:
+        """Report boxes that were late, or are lengthened, and return them."""
         latency = self._latency = self.registrar.latency
         ticket_of(pair.boxes).is_late = latency.seconds != 0
         if latency.warning:
             self._report(Reason.LATENCY, latency.warning, 1)
+        if self.registrar.visible_boxes.warning:
+            self._report(Reason.VISIBLE_BOXES, self.registrar.visible_boxes.warning, 1)
         return pair.boxes

@@ -104,6 +104,7 @@ class Summary:
             )
         source = recording.source
         findings = recording.findings
+        lengthened = registrar.visible_boxes.warning
         return cls(
             recordings=[str(path) for path in request.recordings],
             command=list(request.command),
@@ -129,7 +130,7 @@ class Summary:
             dropped=_dropped(registrar.counts, findings),
             without_stamp=_without_stamp(findings),
             lidars={topic: dict(counts) for topic, counts in findings.lidars.items()},
-            warning='; '.join(filter(None, (findings.warning, latency.warning)))
+            warning='; '.join(filter(None, (findings.warning, latency.warning, lengthened)))
             or ('' if sink.boxes_in or request.boxes == NO_TOPIC else _no_boxes(request)),
             **findings.facts,
             left_out_of_labels=sink.output.left_out(),

@@ -1,0 +1,154 @@
+"""
+Boxes of what a sweep shows of an object, as those of clusters, in place of the whole of it (M12b).
+
+They end where their points do, on all sides, and grow as the object comes near or turns. The side
+toward the sensor is right, the other one is not known: such a box gets the extents of its track,
+away from the sensor.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from boxreg_ros.config import Config
+from boxreg_ros.core.observation import GOOD_POINTS, Observation
+from boxreg_ros.rotations import matrix_from_rpy
+from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL, Z
+import numpy as np
+
+# All of these are chosen, except where an origin stands beside them.
+POINT_DISTANCE = 0.1
+"""
+A side has points if one is so near to it [m].
+
+Measured, boxes with points on all four sides: .83 to .90 of those of clusters; of boxes of whole
+objects .01 to .09 with the errors of a detector, .00 to .29 of true ones.
+
+"""
+MIN_VISIBLE = 0.5
+"""Part of the boxes of a track that end at their points, and of the tracks."""
+MIN_TRACKS, MIN_BOXES = 5, 50
+"""Tracks and boxes that decide: fewer may all be seen from two sides."""
+COMPARED_BOXES = 300
+"""After so many boxes that decide the question is closed."""
+WHOLE_QUANTILE = 0.95
+"""Part of the boxes of a track that are not longer than it: clusters of two objects are few."""
+HELD_EXTENTS = 1000
+"""Newest boxes of a track that show its extents: those of a parked object for 100 s."""
+MIN_CHANGE = 0.05
+"""Change of an extent, as a part, by which boxes of a track are lengthened again."""
+
+WARNING = (
+    'boxes end where their points do, on all sides, as those of clusters: they hold what is seen '
+    'of an object; each is lengthened away from the sensor to the extents that its track has '
+    'shown so far; if boxes are of whole objects, set sampling.box_extents=whole'
+)
+
+
+class VisibleBoxes:
+    """
+    Evidence that the boxes of a stream hold what is seen of their objects.
+
+    It depends on the order of box arrays alone, and is final once it is found.
+
+    Parameters
+    ----------
+    config : Config
+        `sampling.box_extents` says so, or that it is to be found.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._is_open = config.sampling.box_extents == 'auto'
+        self.are_found = config.sampling.box_extents == 'visible'
+        self._boxes, self._visible = Counter[str](), Counter[str]()  # by track
+
+    @property
+    def warning(self) -> str:
+        """Return what a user should know; empty for boxes of whole objects."""
+        return WARNING if self.are_found else ''
+
+    def add(self, track_ids: Sequence[str], seen: Sequence[Observation]) -> bool:
+        """
+        Compare new boxes with their points; return whether they are visible ones from now on.
+
+        Parameters
+        ----------
+        track_ids : sequence of n str
+            Of their tracks.
+        seen : sequence of n Observation
+            Of the boxes as they were given.
+
+        """
+        if not self._is_open:
+            return False
+        for track_id, observation in zip(track_ids, seen, strict=True):
+            is_visible = _ends_at_points(observation)
+            if is_visible is not None:
+                self._boxes[track_id] += 1
+                self._visible[track_id] += is_visible
+        parts = [self._visible[name] >= MIN_VISIBLE * count for name, count in self._boxes.items()]
+        total = self._boxes.total()
+        is_known = len(parts) >= MIN_TRACKS and total >= MIN_BOXES
+        self.are_found = is_known and sum(parts) >= MIN_VISIBLE * len(parts)
+        self._is_open = not self.are_found and not (is_known and total >= COMPARED_BOXES)
+        return self.are_found
+
+
+def _ends_at_points(seen: Observation) -> bool | None:
+    """Return whether all four sides of a box have points; None with too few in it."""
+    half = seen.box[BOX_EXTENT] / 2
+    local = seen.points @ matrix_from_rpy(seen.box[ROLL:])
+    inside = local[(np.abs(local) <= half + POINT_DISTANCE).all(1), :Z]
+    if len(inside) < 2 * GOOD_POINTS:
+        return None
+    ends = np.stack([inside.max(0), -inside.min(0)])
+    return bool((np.abs(ends - half[:Z]) <= POINT_DISTANCE).all())
+
+
+def whole_extents(extents: Sequence[Floats], known: Floats | None) -> Floats:
+    """
+    Return the extents (3,) of an object by those of its visible boxes so far [m].
+
+    Those that are `known` (3,), if they are the same but for `MIN_CHANGE`.
+
+    """
+    found: Floats = np.quantile(extents, WHOLE_QUANTILE, axis=0)
+    if known is not None and (np.abs(found / known - 1) <= MIN_CHANGE).all():
+        return known
+    return found
+
+
+def lengthened(boxes: Floats, extents: Floats, to_sensor: Floats) -> Floats:
+    """
+    Return boxes that are not smaller than some extents, with the faces that are seen in place.
+
+    Parameters
+    ----------
+    boxes : array, shape (n, 9)
+        In the fixed frame [m, rad].
+    extents : array, shape (n, 3)
+        Least length, width and height [m].
+    to_sensor : array, shape (n, 3)
+        Position of the sensor minus the centre of each box, in the fixed frame [m]; NaN where it
+        is unknown.
+
+    Returns
+    -------
+    boxes : array, shape (n, 9)
+        Lengthened at the ends away from the sensor, at the top, and at both ends of an axis where
+        the sensor is between their planes, or unknown.
+
+    """
+    found = boxes.copy()
+    own = boxes[:, BOX_EXTENT]
+    found[:, BOX_EXTENT] = np.maximum(own, extents)
+    R = matrix_from_rpy(boxes[:, ROLL:])
+    local = np.nan_to_num(np.einsum('nji,nj->ni', R, to_sensor))
+    side = np.sign(local) * (np.abs(local) > own / 2)
+    side[:, Z] = -1.0  # all stand on the road
+    shift = side * (found[:, BOX_EXTENT] - own) / 2
+    found[:, BOX_CENTER] -= np.einsum('nij,nj->ni', R, shift)
+    return found
