@@ -27,9 +27,11 @@ Measured, boxes with points on all four sides: .83 to .90 of those of clusters; 
 objects .01 to .09 with the errors of a detector, .00 to .29 of true ones.
 
 """
+MIN_LENGTH = 1.0
+"""Longer side of a box that is compared [m]: those of walkers have points near all sides."""
 MIN_VISIBLE = 0.5
 """Part of the boxes of a track that end at their points, and of the tracks."""
-MIN_TRACKS, MIN_BOXES = 5, 50
+MIN_COMPARED_TRACKS, MIN_BOXES_COMPARED = 5, 50
 """Tracks and boxes that decide: fewer may all be seen from two sides."""
 COMPARED_BOXES = 300
 """After so many boxes that decide the question is closed."""
@@ -40,7 +42,7 @@ HELD_EXTENTS = 1000
 MIN_CHANGE = 0.05
 """Change of an extent, as a part, by which boxes of a track are lengthened again."""
 
-WARNING = (
+VISIBLE_WARNING = (
     'boxes end where their points do, on all sides, as those of clusters: they hold what is seen '
     'of an object; each is lengthened away from the sensor to the extents that its track has '
     'shown so far; if boxes are of whole objects, set sampling.box_extents=whole'
@@ -68,7 +70,7 @@ class VisibleBoxes:
     @property
     def warning(self) -> str:
         """Return what a user should know; empty for boxes of whole objects."""
-        return WARNING if self.are_found else ''
+        return VISIBLE_WARNING if self.are_found else ''
 
     def add(self, track_ids: Sequence[str], seen: Sequence[Observation]) -> bool:
         """
@@ -91,15 +93,17 @@ class VisibleBoxes:
                 self._visible[track_id] += is_visible
         parts = [self._visible[name] >= MIN_VISIBLE * count for name, count in self._boxes.items()]
         total = self._boxes.total()
-        is_known = len(parts) >= MIN_TRACKS and total >= MIN_BOXES
+        is_known = len(parts) >= MIN_COMPARED_TRACKS and total >= MIN_BOXES_COMPARED
         self.are_found = is_known and sum(parts) >= MIN_VISIBLE * len(parts)
         self._is_open = not self.are_found and not (is_known and total >= COMPARED_BOXES)
         return self.are_found
 
 
 def _ends_at_points(seen: Observation) -> bool | None:
-    """Return whether all four sides of a box have points; None with too few in it."""
+    """Return whether all four sides of a box have points; None if it is small, or has few."""
     half = seen.box[BOX_EXTENT] / 2
+    if 2 * half[:Z].max() < MIN_LENGTH:
+        return None
     local = seen.points @ matrix_from_rpy(seen.box[ROLL:])
     inside = local[(np.abs(local) <= half + POINT_DISTANCE).all(1), :Z]
     if len(inside) < 2 * GOOD_POINTS:

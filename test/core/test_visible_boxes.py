@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
-from boxreg_ros.core.visible_boxes import lengthened, MIN_BOXES, whole_extents
+from boxreg_ros.core.visible_boxes import lengthened, MIN_BOXES_COMPARED, whole_extents
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.recording import Recording
 from boxreg_ros.io.session import hand_to_registrar
@@ -88,7 +88,7 @@ def test_boxes_of_whole_objects_are_not_lengthened(whole):
     registrar = BoxRegistrar(Config(estimate='early'))
     for item in whole.items():
         hand_to_registrar(registrar, item, restarts=False)
-    assert registrar.visible_boxes._boxes.total() > MIN_BOXES
+    assert registrar.visible_boxes._boxes.total() > MIN_BOXES_COMPARED
     assert not registrar.visible_boxes.are_found
     assert not registrar.visible_boxes.warning
 
