@@ -199,10 +199,10 @@ class Reason(StrEnum):
     )
     CLOCK_OFFSET = _reason(
         'message',
-        'the clock of its stamps is off from that of the motion, or of the clouds; the log has '
-        'the figure',
+        'the clock of its stamps is off from that of the motion, or of the clouds, or each stamp '
+        'of a cloud is off by itself; the log has the figure',
         'synchronise the clocks (PTP or NTP), or set `clock_offset` or `boxes_offset` as the log '
-        'suggests',
+        'suggests; let the driver of the LiDAR stamp clouds by the time of the sensor',
     )
     FIXED_FRAME_JUMPS = _reason(
         'message',

@@ -13,6 +13,7 @@ from boxreg_ros.io.checks.motion import MotionCheck
 from boxreg_ros.io.checks.motion_time import MotionTimeCheck
 from boxreg_ros.io.checks.place import PlaceCheck
 from boxreg_ros.io.checks.pose import PoseCheck
+from boxreg_ros.io.checks.stamps import StampCheck
 from boxreg_ros.io.checks.twice import TwiceCheck
 from boxreg_ros.io.checks.unit import UnitCheck
 from boxreg_ros.io.id_assignment import Tracker
@@ -43,6 +44,7 @@ class InputChecks:
         self._axis = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
         self._twice = TwiceCheck(config)
+        self._stamps: dict[str, StampCheck] = {}  # by topic of clouds
         self.restart()
 
     def restart(self) -> None:
@@ -90,6 +92,8 @@ class InputChecks:
         if isinstance(given, Sweep):
             self._cloud.add(given)
             self._motion.add_pose(given, fixed_frame, T_fixed_item)
+            stamps = self._stamps.setdefault(given.topic, StampCheck())
+            stamps.add(given, T_fixed_item[:3, 3])
         self._unit.add(moved, T_fixed_item)
         self._pose.add(moved)
         self._place.add(moved, T_fixed_item, self._other_frames(given, fixed_frame, sensor_frame))
@@ -129,8 +133,12 @@ class InputChecks:
         of_classes = '' if self._axis.is_turned else self._pose.class_finding
         of_axes = of_classes or of_ways or self._pose.finding
         poses = self._unit.finding or self._place.finding or of_axes or self._place.flat
-        known = self._motion.findings
+        known = self._motion.findings.copy()
+        of_stamps = [one.finding for one in self._stamps.values() if one.finding]
+        if of_stamps:
+            known.pop('jitter', None)  # odometry of these clouds has their stamps
         texts = [
+            *((Reason.CLOCK_OFFSET, text) for text in of_stamps),
             *((Reason.CLOUD_FAULT, text) for text in self._cloud.findings),
             (Reason.TRANSFORM_FAULT, self._common_motion.finding),
             (Reason.CLOCK_OFFSET, '' if 'clock' in known else self._motion_time.finding),
