@@ -17,6 +17,7 @@ from boxreg_ros.structures import (
     is_valid_box,
 )
 import numpy as np
+from numpy.typing import NDArray
 
 CENTER_STD = 0.3
 """Standard deviation of a detected centre [m]."""
@@ -133,6 +134,17 @@ class _Tracks(Columns):
         found: Floats = away / (covariances[:, 0] + CENTER_STD**2) + unlike / LOG_EXTENT_STD**2
         return found
 
+    def are_apart(self, centers: Floats, boxes: Floats) -> NDArray[np.bool_]:
+        """
+        Return whether boxes (n, 9) and tracks at `centers` (K, 3) are apart, (n, K).
+
+        Boxes of one object that hold what is seen of it change size, and overlap.
+
+        """
+        away = np.linalg.norm(boxes[:, None, BOX_CENTER] - centers, axis=-1)
+        longest = boxes[:, None, BOX_EXTENT].max(-1), self.extents.max(-1, initial=0.0)
+        return np.asarray(away > np.maximum(*longest) / 2)
+
     def update(
         self, predicted: tuple[Floats, Floats], columns: Ints, stamp_ns: int, boxes: Floats
     ) -> None:
@@ -164,6 +176,8 @@ class Costs(NamedTuple):
     """Of the tracks before it."""
     values: Floats
     """(n, tracks) squared distances in standard deviations."""
+    is_apart: NDArray[np.bool_]
+    """(n, tracks), whether the centre of neither is in the other, by half of the longest side."""
 
 
 class Tracker:
@@ -186,7 +200,7 @@ class Tracker:
         """End all tracks; ids that were assigned are not used again."""
         self._tracks = _Tracks.started([], 0, np.zeros((0, 9)))
         self._newest_ns: int | None = None
-        self.costs = Costs(np.zeros(0, np.int64), (), np.zeros((0, 0)))
+        self.costs = Costs(np.zeros(0, np.int64), (), np.zeros((0, 0)), np.zeros((0, 0), bool))
 
     @property
     def track_ids(self) -> tuple[str, ...]:
@@ -223,7 +237,8 @@ class Tracker:
         rows = np.flatnonzero(is_valid_box(boxes.boxes))
         predicted = self._tracks.predicted(boxes.stamp_ns)
         costs = self._tracks.distances(predicted, boxes.boxes[rows, None])
-        self.costs = Costs(rows, self._tracks.ids, costs)
+        is_apart = self._tracks.are_apart(predicted[0], boxes.boxes[rows])
+        self.costs = Costs(rows, self._tracks.ids, costs, is_apart)
         # Costs are cut off at the gate: a pair beyond it costs as much as no pair.
         chosen, columns = linear_sum_assignment(np.minimum(costs, GATE))
         is_near = costs[chosen, columns] < GATE
@@ -380,13 +395,15 @@ class IdCheck:
         self._track_of = kept | given
 
     def _jumps(self, boxes: BoxArray, associated: tuple[str, ...]) -> int:
-        """Count the boxes that are far from the track of their id, and on that of another."""
+        """Count the boxes that are apart from the track of their id, and on that of another."""
         costs = self.tracker.costs
         column_of = {name: column for column, name in enumerate(costs.track_ids)}
         count = 0
-        for row, cost in zip(costs.rows.tolist(), costs.values, strict=True):
+        for at, row in enumerate(costs.rows.tolist()):
             own = column_of.get(self._track_of.get(boxes.track_ids[row], ''))
-            if own is not None and cost[own] >= GATE:
+            if own is None:
+                continue
+            if costs.values[at, own] >= GATE and costs.is_apart[at, own]:
                 count += associated[row] in column_of
         return count
 

@@ -1,6 +1,8 @@
 """Ids by association: an object keeps its id through gaps, crossings and noise."""
 
-from boxreg_ros.io.id_assignment import Tracker
+from dataclasses import replace
+
+from boxreg_ros.io.id_assignment import IdCheck, Tracker
 from boxreg_ros.structures import BoxArray
 import numpy as np
 from paths import SHARED
@@ -157,3 +159,20 @@ def test_boxes_that_do_not_keep_their_tracks_are_still_the_newest_of_these():
     # Tracks that had no box since the first array have ended by now.
     kept = tracker.keep(array(0.55, 'a', 'b'), own)
     assert kept == given
+
+
+def test_ids_of_boxes_that_hold_what_is_seen_do_not_jump():
+    """Of a tram now the rear is seen, now all of it; the ids of two cars that change do jump."""
+    check = IdCheck(max_gap=1.0)
+    swapping = IdCheck(max_gap=1.0)
+    for k in range(60):
+        length = 12.0 if k % 6 > 3 else 3.0
+        tram = 8.0 + 0.8 * k + length / 2, 5.0, (length, 2.6, 3.4)
+        boxes = array_of(START + k * SECOND // 10, tram, (20.0, -3.0, CAR), (27.0, -3.0, CAR))
+        check.add(replace(boxes, track_ids=('tram', 'one', 'other')))
+        ids = ('one', 'other') if k % 6 > 3 else ('other', 'one')
+        swapping.add(replace(boxes, track_ids=('tram', *ids)))
+    assert check.jumps == 0
+    assert not check.finding
+    assert swapping.jumps == 2 * 19
+    assert 'jump from object to object' in swapping.finding
