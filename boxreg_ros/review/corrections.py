@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, groupby, pairwise
-from operator import itemgetter
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
@@ -421,7 +420,8 @@ class Corrections:
                     one._replace(judgement='' if one.judgement == 'reject' else 'accept')
                     for one in rows
                 ]
-            found += _stated(track_id, rows)
+            for topic in dict.fromkeys(topic for one in rows for topic in one.stated):
+                found += _stated(track_id, topic, rows)
             for kind, values in (
                 ('rename', [one.track_id for one in rows]),
                 ('accept', [one.judgement == 'accept' for one in rows]),
@@ -605,35 +605,36 @@ def _ranges(
     return found
 
 
-def _stated(track_id: str, rows: Sequence[_Applied]) -> list[Decision]:
+def _stated(track_id: str, topic: str, rows: Sequence[_Applied]) -> list[Decision]:
     """
-    Return the classes and attributes that the boxes of a track were given, as ranges.
+    Return the classes, or values of an attribute, that the boxes of a track were given, as ranges.
 
     They go as far as what was decided, also where there are no boxes yet. A box that a later run
-    adds between two others has the input track of the first.
+    adds between two others has the input track of the first. Two boxes may have one stamp.
 
     """
     found = []
-    for topic in dict.fromkeys(topic for row in rows for topic in row.stated):
-        values = [row.stated.get(topic) for row in rows]
-        free_ns, before = -MAX_STAMP_NS, rows[0].input_id  # first stamp of the gap, box before it
-        groups = groupby(zip(values, rows, strict=True), itemgetter(0))
-        parts = [(one, [row for _, row in group]) for one, group in groups]
-        ends_ns = [part[0].stamp_ns - 1 for _, part in parts[1:]]
-        for (one, part), end_ns in zip(parts, [*ends_ns, MAX_STAMP_NS], strict=True):
-            last_ns = part[-1].stamp_ns
-            if one is not None:
-                first_ns, last_ns = _span_of(one)
-                is_alike = before == one.track_id
-                first_ns = max(first_ns, free_ns if is_alike else part[0].stamp_ns)
-                last_ns = min(last_ns, end_ns)
-                is_whole = (first_ns, last_ns) == (-MAX_STAMP_NS, MAX_STAMP_NS)
-                span = (None, None) if is_whole else (first_ns, last_ns)
-                found.append(
-                    Decision(track_id, span[0], one.kind, end_ns=span[1], value=one.value)
-                )
-            free_ns, before = last_ns + 1, part[-1].input_id
+    groups = groupby(rows, lambda row: row.stated.get(topic))
+    parts = [(one, [*own]) for one, own in groups]
+    next_ns = [own[0].stamp_ns for _, own in parts[1:]]
+    low_ns, before = -MAX_STAMP_NS, rows[0].input_id  # behind the part before; of its last box
+    for (one, own), high_ns in zip(parts, [*next_ns, MAX_STAMP_NS + 1], strict=True):
+        first_ns, last_ns = own[0].stamp_ns, own[-1].stamp_ns
+        if one is not None:
+            span = _span_of(one)
+            if before == one.track_id:
+                first_ns = min(first_ns, max(span[0], low_ns))
+            last_ns = max(last_ns, min(span[1], high_ns - 1))
+            found.append(_over(track_id, one, first_ns, last_ns))
+        low_ns, before = last_ns + 1, own[-1].input_id
     return found
+
+
+def _over(track_id: str, one: Decision, first_ns: int, last_ns: int) -> Decision:
+    """Return a decision as one about a track from one stamp to another."""
+    is_whole = (first_ns, last_ns) == (-MAX_STAMP_NS, MAX_STAMP_NS)
+    span = (None, None) if is_whole else (first_ns, last_ns)
+    return Decision(track_id, span[0], one.kind, end_ns=span[1], value=one.value)
 
 
 def _span_of(decision: Decision) -> tuple[int, int]:

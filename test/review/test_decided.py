@@ -586,6 +586,20 @@ def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed
     assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
 
 
+def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path):
+    _, stamps, _, out = completed
+    decisions = [
+        Decision('1', None, 'rename', value='2'),
+        Decision('1', stamps[2], 'reclass', end_ns=stamps[4], value='truck'),
+    ]
+    run = Run(out.with_name('drive'))
+    run(tmp_path / 'out', decisions)
+    assert run.status == 0
+    classes = [one for one in read_decisions(tmp_path / 'out' / APPLIED) if one.kind == 'reclass']
+    spans = [(one.stamp_ns, one.end_ns) for one in classes]
+    assert all(any(a <= stamps[k] <= b for a, b in spans) for k in (2, 3, 4))
+
+
 def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):
     _, stamps, _, out = completed
     table = BoxTable.read(out / 'boxes.csv').without_rejected()
