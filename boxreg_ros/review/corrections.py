@@ -125,7 +125,7 @@ class Corrections:
 
     def added(self, tracks: Iterable[FollowedTrack]) -> list[FollowedTrack]:
         """
-        Return followed objects without deleted boxes, with the ids and classes decided.
+        Return followed objects without deleted and rejected boxes, with ids and classes decided.
 
         One whose id the input has is left out: it is there already, as in an earlier result.
 
@@ -136,7 +136,7 @@ class Corrections:
                 continue
             rows_of: dict[tuple[str, str], list[int]] = {}
             for row, stamp_ns in enumerate(track.stamps_ns.tolist()):
-                if self._last('deletion', track.track_id, stamp_ns) is not None:
+                if self.is_left_out(track.track_id, stamp_ns):
                     continue
                 track_id = self.track_id(track.track_id, stamp_ns) or track.track_id
                 class_name = self.class_name(track.track_id, stamp_ns) or track.class_name
@@ -160,13 +160,19 @@ class Corrections:
 
     @property
     def names(self) -> set[str]:
-        """Return the ids that were given."""
-        return {one.value for one in self._of_kind('rename') if not one.is_taken_back}
+        """Return the ids that were given, and those of tracks that others got a part of."""
+        renames = self._renames()
+        return {one.value for one in renames} | {
+            one.track_id for one in renames if one.stamp_ns is not None
+        }
 
     @property
     def apart(self) -> set[str]:
         """Return the ids that were given, and that the input does not have."""
-        return self.names - self._own_ids
+        return {one.value for one in self._renames()} - self._own_ids
+
+    def _renames(self) -> list[Decision]:
+        return [one for one in self._of_kind('rename') if not one.is_taken_back]
 
     def input_id(self, track_id: str, stamp_ns: int) -> str:
         """Return the id in the input of a box that is registered as one of `track_id`."""
@@ -432,37 +438,42 @@ class Corrections:
 
     def _left_empty(self) -> list[Decision]:
         """Return where the tracks of the results have no boxes by a decision: none is added."""
-        places: list[tuple[str, int, int, str]] = []  # with the kind of the decision
+        # With kind and value of the decision.
+        places: list[tuple[str, int, int, str, str]] = []
         parts: dict[str, list[int]] = {}  # first and last stamps of new tracks
         for one in chain.from_iterable(map(self._of_kind, ('delete', 'reject', 'rename'))):
             if one.stamp_ns is None or one.value == one.track_id:
                 continue
             span = _span_of(one)
-            places.append((one.track_id, *span, one.kind))
+            places.append((one.track_id, *span, one.kind, one.value))
             if one.kind != 'rename':
                 renames = (each for each in self._of_track[one.track_id] if each.kind == 'rename')
                 for each in renames:
                     first_ns, last_ns = _span_of(each)
                     part = max(first_ns, span[0]), min(last_ns, span[1])
-                    places.append((each.value, *part, one.kind))
+                    places.append((each.value, *part, one.kind, ''))
             elif one.value in self.apart:
                 parts.setdefault(one.value, []).extend(span)
         for name, ends in parts.items():
-            places.append((name, -MAX_STAMP_NS, min(ends) - 1, 'delete'))
-            places.append((name, max(ends) + 1, MAX_STAMP_NS, 'delete'))
+            places.append((name, -MAX_STAMP_NS, min(ends) - 1, 'delete', ''))
+            places.append((name, max(ends) + 1, MAX_STAMP_NS, 'delete', ''))
+        for name, rows in self._of_result.items():
+            first = self._last('id', rows[0].input_id, rows[0].stamp_ns)
+            if first is not None and first.stamp_ns is not None and first.track_id != name:
+                # It begins with a part of another track.
+                places.append((name, -MAX_STAMP_NS, first.stamp_ns - 1, 'delete', ''))
         found = []
-        for name, first_ns, last_ns, why in dict.fromkeys(places):
-            kind = 'reject' if why == 'reject' else 'delete'
+        for name, first_ns, last_ns, kind, value in dict.fromkeys(places):
             rows = self._of_result.get(name, [])
             # Between rejected boxes there is none, either.
-            left = (one.stamp_ns for one in rows if one.judgement != why)
+            left = (one.stamp_ns for one in rows if one.judgement != kind)
             within = sorted(stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns)
             gaps = [*pairwise([first_ns - 1, *within, last_ns + 1])]
             # From the first box that was joined to the track there, it is not the part given away.
-            for before_ns, after_ns in gaps[:1] if why == 'rename' else gaps:
+            for before_ns, after_ns in gaps[:1] if kind == 'rename' else gaps:
                 if rows and after_ns - before_ns > 1:
                     span = before_ns + 1, after_ns - 1
-                    found.append(Decision(name, span[0], kind, end_ns=span[1]))
+                    found.append(Decision(name, span[0], kind, end_ns=span[1], value=value))
         return found
 
     def _note(

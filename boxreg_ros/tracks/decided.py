@@ -23,12 +23,12 @@ class Decided(Protocol):
 
     @property
     def names(self) -> Collection[str]:
-        """Return the ids that a person gave: each names one object."""
+        """Return the ids that a person gave, or left to a part: each names one object."""
         return ()
 
     @property
     def apart(self) -> Collection[str]:
-        """Return those of `names` that the input does not have: nothing is joined to them."""
+        """Return ids that were given, and that the input does not have: nothing joins them."""
         return ()
 
     def input_id(self, track_id: str, stamp_ns: int) -> str:

@@ -586,6 +586,26 @@ def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed
     assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
 
 
+def test_a_part_given_to_a_track_that_is_there_keeps_both_apart(tmp_path):
+    """Neither stitching nor following joins what is left to the track that has the part."""
+    drive = Drive(sweeps=SWEEPS)
+    for k in range(8, SWEEPS):
+        drive.replace('/boxes', k, lambda message: setattr(message.detections[1], 'id', '5'))
+    recording = drive.write(tmp_path / 'drive')
+    part = [Decision('2', drive.stamps[5], 'rename', end_ns=drive.stamps[7], value='5')]
+    runs = {
+        'plain': Run(recording),
+        'whole': Run(recording, '--complete'),
+        'stitched': Run(recording, '--complete', f'--labels=csv:{tmp_path / "plain"}'),
+        'followed': Run(recording, '--keyframes', f'--labels=csv:{tmp_path / "plain"}'),
+        'again': Run(recording, '--keyframes', f'--labels=csv:{tmp_path / "stitched"}'),
+    }
+    for name, run in runs.items():
+        rows = run(tmp_path / name, part if name in ('plain', 'whole') else ())
+        is_there = [[bool(word) for word in words_of(rows, one, drive.stamps)] for one in '25']
+        assert is_there == [[True] * 5 + [False] * 11, [False] * 5 + [True] * 11], name
+
+
 def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path):
     _, stamps, _, out = completed
     decisions = [

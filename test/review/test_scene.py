@@ -305,10 +305,11 @@ def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, cap
     stamp, box = drive.stamps[4], drive.truth[drive.stamps[4]][1]
     added = Decision('new', stamp, 'add', frame_id='odom', box=box, value='car', who='anna')
     late = Decision('late', stamp + 10**12, 'add', frame_id='odom', box=box, value='car')
-    gone = Decision('new', drive.stamps[9], 'delete', end_ns=drive.stamps[11])
+    gone = Decision('new', drive.stamps[9], 'delete', end_ns=drive.stamps[10])
+    wrong = Decision('new', drive.stamps[11], 'reject')
     joined = Decision('new', drive.stamps[12], 'rename', end_ns=drive.stamps[13], value='end')
     path = tmp_path / DECISIONS
-    DecisionLog(path).append([added, late, gone, joined])
+    DecisionLog(path).append([added, late, gone, wrong, joined])
     command = ['relabel', str(recording), *QUICK, '--decisions', str(path), '-o']
     for name, more in (('plain', []), ('complete', ['--complete'])):
         out = tmp_path / name
