@@ -32,6 +32,9 @@ WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 STATED = ('reclass', 'attribute')
 """Kinds whose values the boxes of a result state, but not whether a person gave them."""
 
+WHOLE_TRACK = 'judgement of the track'
+"""Topic of what was decided about whole tracks, not about their boxes."""
+
 
 class _Applied(NamedTuple):
     """What was decided about one box of the result; empty for nothing."""
@@ -40,8 +43,8 @@ class _Applied(NamedTuple):
     input_id: str
     track_id: str
     judgement: str
-    of_track: str  # judgement of its whole track
-    stated: Mapping[str, Decision]  # by topic: those of `STATED`, with the value of the box
+    # By topic: those of `STATED`, with the value of the box; and a rejection of its whole track.
+    stated: Mapping[str, Decision]
 
 
 class Corrections:
@@ -420,14 +423,14 @@ class Corrections:
             rows.sort()
             if track_id in apart:  # also boxes that a step has added
                 rows = [one._replace(track_id=track_id) for one in rows]
-            if {one.of_track for one in rows} == {'reject'}:  # where it has no boxes, too
-                found.append(Decision(track_id, None, 'reject'))
-                rows = [
-                    one._replace(judgement='' if one.judgement == 'reject' else 'accept')
-                    for one in rows
-                ]
             for topic in dict.fromkeys(topic for one in rows for topic in one.stated):
                 found += _stated(track_id, topic, rows)
+            rows = [
+                one._replace(judgement='' if one.judgement == 'reject' else 'accept')
+                if WHOLE_TRACK in one.stated
+                else one
+                for one in rows
+            ]
             for kind, values in (
                 ('rename', [one.track_id for one in rows]),
                 ('accept', [one.judgement == 'accept' for one in rows]),
@@ -493,13 +496,14 @@ class Corrections:
                 value = f'{name}={attributes[name]}' if name in attributes else ''
             if value:
                 stated[topic] = replace(one, track_id=input_id, value=value)
+        if of_track is not None and of_track.kind == 'reject':
+            stated[WHOLE_TRACK] = of_track
         self._of_result.setdefault(track_id, []).append(
             _Applied(
                 stamp_ns,
                 input_id,
                 self.track_id(input_id, stamp_ns),
                 '' if judgement is None else judgement.kind,
-                '' if of_track is None else of_track.kind,
                 stated,
             )
         )
@@ -609,7 +613,7 @@ def _ranges(
     for value, rows in groupby(zip(values, stamps_ns, strict=True), lambda row: row[0]):
         if value:
             within = [stamp_ns for _, stamp_ns in rows]
-            is_whole = len(within) == len(stamps_ns)
+            is_whole = kind == 'rename' and len(within) == len(stamps_ns)
             span = (None, None) if is_whole else (within[0], within[-1])
             text = value if isinstance(value, str) else ''
             found.append(Decision(track_id, span[0], kind, end_ns=span[1], value=text))
@@ -618,7 +622,7 @@ def _ranges(
 
 def _stated(track_id: str, topic: str, rows: Sequence[_Applied]) -> list[Decision]:
     """
-    Return the classes, or values of an attribute, that the boxes of a track were given, as ranges.
+    Return what the boxes of a track were given of a topic of `_Applied.stated`, as ranges.
 
     They go as far as what was decided, also where there are no boxes yet. A box that a later run
     adds between two others has the input track of the first. Two boxes may have one stamp.

@@ -586,11 +586,33 @@ def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed
     assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
 
 
-def test_a_part_given_to_a_track_that_is_there_keeps_both_apart(tmp_path):
-    """Neither stitching nor following joins what is left to the track that has the part."""
+def in_two_parts():
+    """Return a drive whose track 2 goes on as 5."""
     drive = Drive(sweeps=SWEEPS)
     for k in range(8, SWEEPS):
         drive.replace('/boxes', k, lambda message: setattr(message.detections[1], 'id', '5'))
+    return drive
+
+
+def test_a_rejected_part_of_a_track_gets_no_boxes_by_later_runs(tmp_path):
+    """Though a run has stitched it to a part that is not rejected."""
+    drive = in_two_parts()
+    for k in range(3):
+        drive.replace('/boxes', k, lambda message: message.detections.pop(1))
+    recording = drive.write(tmp_path / 'drive')
+    decisions = [Decision('2', None, 'reject'), Decision('2', drive.stamps[4], 'accept')]
+    labels = None
+    for name in ('0', '1', '2'):
+        run = Run(recording, '--complete', *([f'--labels=csv:{labels}'] if labels else []))
+        rows = run(tmp_path / name, () if labels else decisions)
+        labels = tmp_path / name
+        words = words_of(rows, '5', drive.stamps)  # the longer part
+        assert words == [''] * 3 + ['kept', 'refined'] + ['kept'] * 3 + ['refined'] * 8
+
+
+def test_a_part_given_to_a_track_that_is_there_keeps_both_apart(tmp_path):
+    """Neither stitching nor following joins what is left to the track that has the part."""
+    drive = in_two_parts()
     recording = drive.write(tmp_path / 'drive')
     part = [Decision('2', drive.stamps[5], 'rename', end_ns=drive.stamps[7], value='5')]
     runs = {
