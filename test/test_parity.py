@@ -181,14 +181,16 @@ def assert_equal_boxes(found, expected):
     assert difference.max() < 1e-6
 
 
-def late(drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0):
+def late(drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0, swapped=False):
     """
     Return a drive whose boxes are stamped and received later, up to the last transform.
 
     They go on for so long `behind` it [s].
 
     `jitter` [s] is the largest deviation from `seconds`; boxes in the frame odom are where their
-    objects were. The clouds of the sweeps in `lost` are left out.
+    objects were. The clouds of the sweeps in `lost` are left out. Where `swapped`, every second
+    cloud is received after the next one and its boxes. The first such cloud has no boxes: whether
+    these wait for it depends on which of both the node receives first.
 
     """
     rng = np.random.default_rng(0)
@@ -198,9 +200,13 @@ def late(drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0):
     for topic, received, message in drive.items:
         if topic != '/boxes':
             is_lost = topic in ('/points', '/front', '/rear') and stamp_of(message) in lost_ns
+            if swapped and topic == '/points' and drive.stamps.index(stamp_of(message)) % 2:
+                received += round(0.15 * SECOND)
             items += [] if is_lost else [(topic, received, message)]
             continue
         measured_ns = stamp_of(message)
+        if swapped and measured_ns == drive.stamps[1]:
+            continue
         delay_ns = round((seconds + rng.uniform(-jitter, jitter)) * SECOND)
         header = drive.messages.header(measured_ns + delay_ns, frame)
         for detection in message.detections:
@@ -221,6 +227,7 @@ LATE = {
     'late': (0.2, {}),
     'late, fixed frame, cloud lost': (0.2, {'frame': 'odom', 'lost': (14,)}),
     'jitter, two LiDARs': (0.2, {'jitter': 0.03}),
+    'in time, clouds swapped': (0.0, {'swapped': True}),
     'late, behind the last transform': (0.5, {'behind': 1.0}),
 }
 
