@@ -35,6 +35,7 @@ from boxreg_ros.live.params import changed, declare, numbers_as_declared, parame
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.polling import PolledClockNode
 from boxreg_ros.live.topics import (
+    BOXES_TOPICS,
     Endpoint,
     FOLLOW_TOPIC,
     import_message,
@@ -57,9 +58,8 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 NAME = 'boxreg_node'
-BOXES_TOPICS = {False: 'refined_boxes', True: 'refined_boxes_final'}
 LABELS_TOPICS = {False: EARLY_TOPIC, True: LABELS_TOPIC}
-"""Topics of early (False) and final (True) boxes, and of what label files hold of them."""
+"""Topics of what label files hold of early (False) and final (True) boxes."""
 GRAPH_PERIOD = 0.2
 """Time between two looks for the type of the boxes [s]."""
 STATUS_PERIOD = 1.0

@@ -14,7 +14,7 @@ from boxreg_ros.live.diagnostics import diagnosis, Health
 from boxreg_ros.live.polling import NO_EVENTS, PolledGroup, taken
 from boxreg_ros.reasons import Reason
 from diagnostic_msgs.msg import DiagnosticStatus
-from msg_adapters import canonical
+from msg_adapters import canonical, CLOUD_TYPES
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -47,6 +47,8 @@ RCLPY_TOPICS = ('/clock', '/parameter_events', '/rosout')
 """Topics of every node, whose QoS overrides rclpy takes."""
 TF_TOPIC = '/tf'
 """Of moving transforms, as of tf2; a robot in a namespace has it there."""
+BOXES_TOPICS = {False: 'refined_boxes', True: 'refined_boxes_final'}
+"""Topics of early (False) and final (True) boxes."""
 FOLLOW_TOPIC = '~/follow'
 """Boxes of a person, whose objects are followed."""
 INFINITE_NS = 9223372036854775807
@@ -224,6 +226,8 @@ class NodeTopics:
                 found.append(_type_problem(endpoint, other_type))
             if endpoint.is_input:
                 found += self._silence(endpoint, peers)
+            elif endpoint.topic in BOXES_TOPICS.values():
+                found += self._published_twice(endpoint)
             if endpoint.topic == TF_TOPIC and not peers:
                 found += self._other_transforms(endpoint)
             if endpoint.topic == FOLLOW_TOPIC and not peers:
@@ -317,6 +321,17 @@ class NodeTopics:
             yield TopicProblem(
                 f'{endpoint.name}: nothing received yet from {nodes_of(peers)}; check that '
                 f'messages are sent, and shared memory and network in between',
+            )
+
+    def _published_twice(self, endpoint: Endpoint) -> Iterator[TopicProblem]:
+        """Yield a problem if others publish refined boxes on the topic of this node, too."""
+        publishers = self._node.get_publishers_info_by_topic(endpoint.topic)
+        if len(publishers) > 1:
+            yield TopicProblem(
+                f'{endpoint.name}: expected this node alone to publish it, got {len(publishers)} '
+                f'publishers, of {nodes_of(publishers)}: who subscribes gets the boxes of all; '
+                f'end the others, leave the topic out of a recording that is played, or remap '
+                f'{endpoint.topic}',
             )
 
     def _is_remapped(self, topic: str) -> bool:
@@ -455,6 +470,8 @@ def _type_problem(endpoint: Endpoint, peers: list[TopicEndpointInfo]) -> TopicPr
     remedy = f'remap {endpoint.topic} to a topic of the expected type'
     if endpoint.topic == FOLLOW_TOPIC:
         remedy = 'publish boxes to follow as the type of boxes'
+    if endpoint.type_name in CLOUD_TYPES and types in CLOUD_TYPES:
+        remedy = f'set points_type:={types}'
     if endpoint.topic == 'boxes':
         remedy = 'set boxes_type, or restart the node if the type of the topic has changed'
     return TopicProblem(

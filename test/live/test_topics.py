@@ -16,6 +16,7 @@ from boxreg_ros.live.topics import (
     qos_problems,
 )
 from diagnostic_msgs.msg import DiagnosticStatus
+from msg_adapters.clouds import COMPRESSED_TYPE
 from msg_adapters.convention import Convention
 from preloaded import CODE, IMPATIENT_NODE
 import pytest
@@ -175,6 +176,10 @@ def test_wrong_message_type_is_reported(graph):
     parts = (f'/points: expected messages of type {POINTS}', f'got {DETECTIONS} from /neighbour')
     assert '[ERROR]' in reported(graph, node, diagnostics, *parts)
     assert '[ERROR]' in reported(graph, node, diagnostics, '/boxes', 'std_msgs/msg/String')
+    graph.node.destroy_publisher(graph.publishers.pop('/points'))
+    graph.publisher(COMPRESSED_TYPE, '/points')
+    remedy = f'set points_type:={COMPRESSED_TYPE}'
+    assert '[ERROR]' in reported(graph, node, diagnostics, '/points', remedy)
     assert ended_cleanly(node)
 
 
@@ -207,6 +212,18 @@ def test_mistyped_remaps_are_reported_with_the_existing_topics(graph):
         parts = (f'{name}: nobody publishes it', f'fitting type: {candidate}; check the remap')
         assert '[WARN]' in reported(graph, node, diagnostics, *parts)
     assert topics_status(diagnostics).level == DiagnosticStatus.WARN
+    assert ended_cleanly(node)
+
+
+def test_another_publisher_of_the_refined_boxes_is_reported(graph):
+    diagnostics = graph.collect(DIAGNOSTICS, '/diagnostics')
+    node = graph.start('-p', f'boxes_type:={DETECTIONS}')
+    graph.wait(lambda: topics_status(diagnostics), 'the state of the topics')
+    assert 'alone' not in topics_status(diagnostics).message
+    graph.publisher(DETECTIONS, '/refined_boxes_final')  # as a player of a recording does
+    parts = ('/refined_boxes_final: expected this node alone', '/boxreg_node, /neighbour')
+    assert '[WARN]' in reported(graph, node, diagnostics, *parts)
+    assert '/refined_boxes: ' not in topics_status(diagnostics).message
     assert ended_cleanly(node)
 
 
