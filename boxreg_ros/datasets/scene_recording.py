@@ -34,8 +34,8 @@ class SceneRecording:
     One sweep is in memory at a time. Sweeps that cannot be read are counted and left out. The
     LiDARs are by default the main one of the data set; `start` and `end` are counted from the
     first sweep [s]; with `labels`, a format and a path, the boxes are those of label files and
-    not the annotations; with `keyframes` boxes that no person made are left out. Entering raises
-    RecordingError if the scene or a part of it is missing.
+    not the annotations; with `keyframes` boxes that no person made are left out, and rejected ones
+    but `with_rejected`. Entering raises RecordingError if the scene or a part of it is missing.
 
     """
 
@@ -51,6 +51,7 @@ class SceneRecording:
     labels: tuple[str, Path] | None = None
     convention: Convention = STANDARD
     keyframes: bool = False
+    with_rejected: bool = False
 
     def __post_init__(self) -> None:
         """Begin with nothing read."""
@@ -155,7 +156,9 @@ class SceneRecording:
         frames = self._frames() if self.has_boxes else iter(())
         is_part = self.start is not None or self.end is not None
         sensor_frame = self.sensor_frame()
-        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self.keyframes)
+        merger = LabelMerger(
+            frames, tree, sensor_frame, self.start_ns, is_part, self.keyframes, self.with_rejected
+        )
         num_poses = 0
         for sweep in self._scene.sweeps():
             stamp_ns = sweep.stamp_ns

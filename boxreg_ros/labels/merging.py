@@ -27,7 +27,7 @@ class LabelMerger:
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and move
     with the recording; the others are taken in the frame that the labels name. Boxes of the status
     ``human`` are pinned. The stamps of `frames` ascend; with `keyframes` boxes that no person made
-    are left out. Where only a part of the recording, from
+    are left out, and rejected ones but `with_rejected`. Where only a part of the recording, from
     `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them;
     `left_out` counts those that the frames lack, by reason; `notes` has what their reader assumed.
 
@@ -41,13 +41,14 @@ class LabelMerger:
     start_ns: int
     is_part: bool
     keyframes: bool
+    with_rejected: bool = False
 
     def __post_init__(self) -> None:
         """Read the first frame."""
         self.outside = 0
         self.left_out: Counter[str] = Counter()
         self.notes: list[str] = []
-        labels = (frame.labels() for frame in self.frames)
+        labels = self.frames if self.with_rejected else (one.labels() for one in self.frames)
         self._frames = keyframes_of(labels) if self.keyframes else labels
         self._next = next(self._frames, None)
         self._received_ns = self.start_ns

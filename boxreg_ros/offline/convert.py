@@ -205,7 +205,7 @@ def _read_with_recording(
     config = Config()
     waiting = deque[LabelFrame]()  # merged clouds are complete later than the boxes of their time
     spool = Spool(folder, config) if request.options.with_points else None
-    with source_of(request) as recording:
+    with source_of(request, with_rejected=True) as recording:
         items = FixedFrameItems(recording, config, fixed_frame=request.fixed_frame)
         fixed_frame = items.fixed_frame
         sensor_frame = label_frame_of(recording, items.tree, fixed_frame, request.label_frame)

@@ -37,19 +37,20 @@ class LabelledRecording(Recording):
         paths: Any,
         convention: Convention,
         keyframes: bool = False,
+        with_rejected: bool = False,
         **options: Any,
     ) -> None:
         super().__init__(paths, **options)
         self._labels = labels
         self._label_convention = convention
-        self._keyframes = keyframes
+        self._choice = keyframes, with_rejected
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
         frames = frames_of(*self._labels, convention=self._label_convention)
         sensor_frame, is_part = self.sensor_frame(), self._is_part
-        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, self._keyframes)
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, *self._choice)
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
                 yield cloud
@@ -124,8 +125,13 @@ def writer_options(request: Request) -> Options:
         return replace(request.options, scene_camera=recording.camera)
 
 
-def source_of(request: Request) -> Recording | SceneRecording:
-    """Return the recording or the scene of a data set that a request names, not yet open."""
+def source_of(request: Request, with_rejected: bool = False) -> Recording | SceneRecording:
+    """
+    Return the recording or the scene of a data set that a request names, not yet open.
+
+    Labels are those of the files, rejected ones only `with_rejected`.
+
+    """
     address = scene_address(request.recordings)
     if address is not None:
         _check_scene(address, request)
@@ -137,14 +143,13 @@ def source_of(request: Request) -> Recording | SceneRecording:
             request.labels,
             request.convention,
             request.keyframes,
+            with_rejected,
         )
     names = ('lidars', 'odometry', 'start', 'end', 'tf', 'clock_offset')
     options = {name: getattr(request, name) for name in names}
     if request.labels is not None:
-        convention = request.convention
-        return LabelledRecording(
-            request.labels, request.recordings, convention, request.keyframes, **options
-        )
+        choice = request.convention, request.keyframes, with_rejected
+        return LabelledRecording(request.labels, request.recordings, *choice, **options)
     if request.boxes == NO_TOPIC:
         return UnlabelledRecording(request.recordings, **options)
     options |= {'boxes': request.boxes, 'convention': request.convention}

@@ -304,7 +304,8 @@ def test_rejected_boxes_are_no_labels_of_other_formats(tmp_path, drive, capsys):
     assert found == list(status[1:])
     words[-1] = str(tmp_path / 'placed')
     assert cli.main([*words, '--recording', str(recording)]) == 0
-    assert 'labels: 1 boxes are left out (rejected_label)' in capsys.readouterr().out
+    assert '1 boxes are rejected' in capsys.readouterr().out
+    assert BoxTable.read(tmp_path / 'placed' / 'boxes.csv').status == status
 
 
 def test_convert_skips_unreadable_clouds(tmp_path, drive, capsys):
