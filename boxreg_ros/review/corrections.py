@@ -486,12 +486,15 @@ class Corrections:
         judgement = self._judgement(input_id, stamp_ns)
         of_track = self._judgement(input_id, MAX_STAMP_NS + 1)  # of no box
         own = self._last('class', input_id, stamp_ns), *self._last_attributes(input_id, stamp_ns)
-        known = self._stated_earlier(input_id, stamp_ns)
+        added = (one for one in self._of_track.get(input_id, ()) if one.kind == 'add')
+        as_class = [replace(one, stamp_ns=None, kind='reclass', box=None) for one in added]
+        known = {one.topic: one for one in as_class}
+        known |= self._stated_earlier(input_id, stamp_ns)
         known |= {one.topic: one for one in own if one is not None}
         stated = {}
         for topic, one in known.items():
             name, _ = one.attribute
-            value = self.class_name(input_id, stamp_ns)
+            value = self.class_name(input_id, stamp_ns) or one.value
             if topic != 'class':
                 value = f'{name}={attributes[name]}' if name in attributes else ''
             if value:

@@ -13,7 +13,7 @@ from boxreg_ros.errors import RecordingError
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
+from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.fit import drawn, fitted, USUAL_EXTENTS
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
@@ -323,6 +323,9 @@ def test_a_run_follows_added_objects_beside_its_other_steps(drive, tmp_path, cap
         assert table.status[row] == 'human'
         np.testing.assert_allclose(table.boxes[row], box, atol=1e-6)
         assert np.median(ious_with_truth(table, drive, 'new')) > 0.8
+    applied = read_decisions(tmp_path / 'plain' / APPLIED)  # its class, to later runs
+    classes = {one.track_id: one.value for one in applied if one.kind == 'reclass'}
+    assert classes == {'new': 'car', 'end': 'car'}
     again = tmp_path / 'again'  # its labels have what was added: it is not added twice
     assert main([*command, str(again), '--labels', f'csv:{tmp_path}/plain']) == 1
     assert "'new' at " in capsys.readouterr().err.splitlines()[-1]
