@@ -436,7 +436,7 @@ class Corrections:
                 ('accept', [one.judgement == 'accept' for one in rows]),
                 ('reject', [one.judgement == 'reject' for one in rows]),
             ):
-                found += _ranges(track_id, kind, [one.stamp_ns for one in rows], values)
+                found += _ranges(track_id, kind, rows, values)
         return held(found + self._left_empty())
 
     def _left_empty(self) -> list[Decision]:
@@ -609,14 +609,15 @@ def _array_of(one: Decision, track_id: str, class_name: str) -> BoxArray:
 
 
 def _ranges(
-    track_id: str, kind: str, stamps_ns: Sequence[int], values: Sequence[str | bool]
+    track_id: str, kind: str, rows: Sequence[_Applied], values: Sequence[str | bool]
 ) -> list[Decision]:
     """Return decisions with the values of a track's boxes: one for each range of equal ones."""
     found = []
-    for value, rows in groupby(zip(values, stamps_ns, strict=True), lambda row: row[0]):
+    is_rejected = any(WHOLE_TRACK in row.stated for row in rows)  # of which boxes are accepted
+    for value, own in groupby(zip(values, rows, strict=True), lambda row: row[0]):
         if value:
-            within = [stamp_ns for _, stamp_ns in rows]
-            is_whole = kind == 'rename' and len(within) == len(stamps_ns)
+            within = [row.stamp_ns for _, row in own]
+            is_whole = len(within) == len(rows) and not (is_rejected and kind == 'accept')
             span = (None, None) if is_whole else (within[0], within[-1])
             text = value if isinstance(value, str) else ''
             found.append(Decision(track_id, span[0], kind, end_ns=span[1], value=text))
