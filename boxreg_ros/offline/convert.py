@@ -116,9 +116,15 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             counts['rejected_boxes'] += frame.refined.status.count(REJECTED)
             output.write(frame)
         output.close()
+        warnings = [request.unbound_text(False)]
         applied = request.applied_decisions()
         if applied is not None and 'csv' in request.formats:
             copyfile(applied, folder / applied.name)
+        elif applied is not None:
+            warnings.append(
+                f'{applied.name}, the decisions of a person, goes with csv alone and binds no run '
+                f'on other labels: use --labels csv:{applied.parent} for these'
+            )
         left_out = output.left_out()
         _require_valid_boxes(source, counts)
         _require_boxes(request, left_out, counts['boxes'] - counts['rejected_boxes'])
@@ -131,7 +137,7 @@ def convert(request: Request, out: Path) -> dict[str, Any]:
             'left_out_of_source': dict(+not_read),
             'assumed': assumed,
             **unused,
-            'warning': '; '.join(filter(None, (axes.finding, request.unbound_text(False)))),
+            'warning': '; '.join(filter(None, (axes.finding, *warnings))),
             'left_out_of_labels': left_out,
             'label_notes': output.notes(),
             'versions': {'boxreg_ros': __version__},

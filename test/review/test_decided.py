@@ -524,6 +524,7 @@ def test_decisions_bind_later_runs_on_the_result(completed, tmp_path, capsys, op
     assert read_decisions(tmp_path / '3' / APPLIED) == read_decisions(tmp_path / '2' / APPLIED)
     other = tmp_path / '3' / 'openlabel'
     main(['convert', str(other.parent), '-o', f'{other}x', '--from=csv', '--to=openlabel'])
+    assert f'use --labels csv:{other.parent} for these' in capsys.readouterr().out
     Path(f'{other}x', 'openlabel').rename(other)
     capsys.readouterr()
     Run(recording, '--labels', f'openlabel:{other}', '--complete')(tmp_path / '4')
