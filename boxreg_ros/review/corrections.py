@@ -471,6 +471,8 @@ class Corrections:
             # Between rejected boxes there is none, either.
             left = (one.stamp_ns for one in rows if one.judgement != kind)
             within = sorted(stamp_ns for stamp_ns in left if first_ns <= stamp_ns <= last_ns)
+            if within and kind == 'delete' and MAX_STAMP_NS in (-first_ns, last_ns):
+                continue  # beyond an end of a part, which a person has joined to one there
             gaps = [*pairwise([first_ns - 1, *within, last_ns + 1])]
             # From the first box that was joined to the track there, it is not the part given away.
             for before_ns, after_ns in gaps[:1] if kind == 'rename' else gaps:

@@ -587,6 +587,17 @@ def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed
     assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
 
 
+def test_a_split_track_that_is_joined_again_is_filled(completed, tmp_path):
+    _, stamps, _, out = completed
+    recording = out.with_name('drive')
+    split = [Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2')]
+    Run(recording)(tmp_path / '0', split)
+    again = Run(recording, f'--labels=csv:{tmp_path / "0"}')
+    again(tmp_path / '1', [Decision('2_2', None, 'rename', value='2')])
+    rows = Run(recording, '--complete', f'--labels=csv:{tmp_path / "1"}')(tmp_path / '2')
+    assert '' not in words_of(rows, '2', stamps)
+
+
 def in_two_parts():
     """Return a drive whose track 2 goes on as 5."""
     drive = Drive(sweeps=SWEEPS)
