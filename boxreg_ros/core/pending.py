@@ -266,7 +266,7 @@ class ObservedTrack:
     """Points inside a predicted box that confirm it, known after the first missed detection."""
     extents: deque[Floats] = field(default_factory=lambda: deque(maxlen=HELD_EXTENTS))
     """(3,) of each box, where boxes hold what is seen of their objects [m]."""
-    whole_extents: Floats | None = None
+    whole: Floats | None = None
     """(3,), what these show of the object [m]."""
 
     @property
@@ -291,14 +291,14 @@ class ObservedTrack:
     def shown_extents(self, box: Floats) -> Floats:
         """Return what the boxes up to a visible one show of the extents of the object [m]."""
         self.extents.append(box[BOX_EXTENT])
-        whole = whole_extents(self.extents, self.whole_extents)
-        if whole is not self.whole_extents:
+        whole = whole_extents(self.extents, self.whole)
+        if whole is not self.whole:
             self._lengthen(whole)
         return whole
 
     def _lengthen(self, whole: Floats) -> None:
         """Give the boxes whose observations are held the extents of the object."""
-        self.whole_extents, self.prior = whole, None
+        self.whole, self.prior = whole, None
         self.starts = [*self.starts]
         for row, (entry, old) in enumerate(zip(self.entries, self.seen, strict=True)):
             if entry.given is None:
