@@ -123,12 +123,6 @@ class PendingArray:
             one.array = self
             one.place = place
 
-    def lengthen(self, one: PendingBox) -> None:
-        """Let a box of the array be the one to register, and to return if it is kept."""
-        boxes = self.input.boxes.copy()
-        boxes[one.row] = one.box
-        self.input = replace(self.input, boxes=boxes)
-
     def add_predicted(self, track: ObservedTrack, one: PendingBox) -> None:
         """Add the predicted box of a track as a row."""
         given = self.input
@@ -149,10 +143,14 @@ class PendingArray:
             self.followed.append(one.row)
 
     def kept(self) -> Estimates:
-        """Return the input boxes as estimates that keep them."""
+        """Return the boxes to register as estimates that keep them."""
         n = len(self.observed)
+        boxes = self.input.boxes.copy()
+        for row, one in enumerate(self.observed):
+            if one is not None:
+                boxes[row] = one.box
         return Estimates(
-            boxes=self.input.boxes,
+            boxes=boxes,
             status=np.full(n, KEPT),
             reasons=np.array(self.reasons, np.str_),
             covariances=np.repeat(np.eye(6)[None], n, axis=0),
@@ -219,7 +217,7 @@ class PendingBox:
 
     stamp_ns: int
     box: Floats
-    """(9,), of the input, or predicted."""
+    """(9,), of the input, lengthened where it holds what is seen of its object, or predicted."""
     row: int = -1
     """In its array, which the estimate is written to; -1 while a predicted box has none."""
     is_predicted: bool = False
@@ -231,13 +229,7 @@ class PendingBox:
     """Estimates of the windows that it was last in, and its row there."""
     is_settled: bool = False
     given: Floats | None = None
-    """(9,), before it was lengthened; None if it was not."""
-
-    @property
-    def is_pinned(self) -> bool:
-        """Return whether a person has corrected the box."""
-        pinned = self.array.input.pinned
-        return pinned is not None and bool(pinned[self.row])
+    """(9,), of the input, where `box` may be longer; else None."""
 
     def settle(self) -> None:
         """Let the estimate in the box array change no more."""
@@ -279,40 +271,42 @@ class ObservedTrack:
         self.entries.append(one)
         self.seen.append(observation)
 
-    def begin_lengthening(self) -> None:
-        """Lengthen boxes that were not known to hold what is seen of their object."""
-        for entry in self.entries:
-            if not (entry.is_predicted or entry.is_pinned):
+    def lengthen(self) -> None:
+        """
+        Give boxes that hold what is seen of the object the extents that it has shown so far.
+
+        The newest ones; all that are held where these extents have changed. Boxes of a person, and
+        predicted ones, stay.
+
+        """
+        new = []
+        for row, (entry, one) in enumerate(zip(self.entries, self.seen, strict=True)):
+            if entry.given is None and not (entry.is_predicted or one.table.is_pinned[one.row]):
                 entry.given = entry.box
                 self.extents.append(entry.box[BOX_EXTENT])
-        if self.extents:
-            self._lengthen(whole_extents(self.extents, None))
-
-    def shown_extents(self, box: Floats) -> Floats:
-        """Return what the boxes up to a visible one show of the extents of the object [m]."""
-        self.extents.append(box[BOX_EXTENT])
+                new.append(row)
+        if not self.extents:
+            return
         whole = whole_extents(self.extents, self.whole)
         if whole is not self.whole:
-            self._lengthen(whole)
-        return whole
+            self.whole, self.prior = whole, None
+            self.starts = [*self.starts]
+            new = [row for row, entry in enumerate(self.entries) if entry.given is not None]
+        for row in new:
+            self._lengthen(row, whole)
 
-    def _lengthen(self, whole: Floats) -> None:
-        """Give the boxes whose observations are held the extents of the object."""
-        self.whole, self.prior = whole, None
-        self.starts = [*self.starts]
-        for row, (entry, old) in enumerate(zip(self.entries, self.seen, strict=True)):
-            if entry.given is None:
-                continue
-            sensor = old.box[BOX_CENTER] + old.table.origins[old.row, 0]
-            box = _lengthened(entry.given, whole, sensor)
-            shift = old.box[None, BOX_CENTER] - box[BOX_CENTER]
-            alone = old.table.take(np.array([old.row]))
-            self.seen[row] = Observation(alone.relative_to(box[None], shift), 0)
-            entry.box, entry.place = box, box[: HEIGHT + 1].tolist()
-            if not entry.is_settled:
-                entry.array.lengthen(entry)
-            if row < len(self.starts):
-                self.starts[row] = _lengthened(self.starts[row], whole, sensor)
+    def _lengthen(self, row: int, whole: Floats) -> None:
+        """Give a box whose observation is held some extents (3,) [m]."""
+        entry, old = self.entries[row], self.seen[row]
+        assert entry.given is not None
+        sensor = old.box[BOX_CENTER] + old.table.origins[old.row, 0]
+        box = lengthened(entry.given, whole, sensor)
+        alone = old.table.take(np.array([old.row]))
+        shift = old.box[BOX_CENTER] - box[BOX_CENTER]
+        self.seen[row] = Observation(alone.relative_to(box[None], shift[None]), 0)
+        entry.box, entry.place = box, box[: HEIGHT + 1].tolist()
+        if row < len(self.starts):
+            self.starts[row] = lengthened(self.starts[row], whole, sensor)
 
     def is_in(self, array: PendingArray) -> bool:
         """Return whether the newest observation is of `array`."""
@@ -406,10 +400,3 @@ class ObservedTrack:
         for row, entry in enumerate(entries, begin):
             if not entry.is_settled:
                 entry.estimate = table, row
-
-
-def _lengthened(box: Floats, extents: Floats, sensor: Floats) -> Floats:
-    """Return a box (9,) with the extents (3,) of its object, seen from a position (3,)."""
-    (found,) = lengthened(box[None], extents[None], (sensor - box[BOX_CENTER])[None])
-    whole: Floats = found
-    return whole

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain, takewhile
 from math import ceil, inf
@@ -24,7 +23,7 @@ from boxreg_ros.core.pending import ObservedTrack, PendingArray, PendingBox, res
 from boxreg_ros.core.problem import settings_of_kinds
 from boxreg_ros.core.support import is_owned, points_inside
 from boxreg_ros.core.tables import by_table
-from boxreg_ros.core.visible_boxes import lengthened, VisibleBoxes
+from boxreg_ros.core.visible_boxes import VisibleBoxes
 from boxreg_ros.core.window import Estimate, PRIOR_POSES, Window
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.reasons import Reason
@@ -473,10 +472,8 @@ class BoxRegistrar:
 
     def _observe(self, array: PendingArray, sweep: Sweep) -> None:
         """Add an observation to the track of each box that has no reason not to be refined."""
-        given = self._given(array)
-        if self.visible_boxes.are_found:
-            _lengthen(array, given, sweep)
         boxes = array.input
+        given = self._given(array)
         coasting = [*self._followed(array, sweep), *self._coasting(array)]
         if not (given or coasting):
             return
@@ -496,6 +493,8 @@ class BoxRegistrar:
         for (track, one), observation in zip(given, seen, strict=False):
             track.add(one, observation)
             track.detected_ns = boxes.stamp_ns
+            if self.visible_boxes.are_found:
+                track.lengthen()
             successor = track.split_at_id_switch()
             if successor is not None:
                 self._end([track.track_id])
@@ -504,7 +503,7 @@ class BoxRegistrar:
             track.add(one, observation)
         if self.visible_boxes.add(track_ids, seen[: len(given)]):
             for track in (*self._ended_tracks, *self._tracks.values()):
-                track.begin_lengthening()
+                track.lengthen()
 
     def _given(self, array: PendingArray) -> list[_OfTrack]:
         """Return the boxes that have no reason not to be refined."""
@@ -699,22 +698,6 @@ class BoxRegistrar:
         ready = self._ready
         self._ready = []
         return ready
-
-
-def _lengthen(array: PendingArray, given: list[_OfTrack], sweep: Sweep) -> None:
-    """Give boxes that hold what is seen of their objects the extents that their tracks have."""
-    pinned = array.input.pinned
-    lengthening = [pair for pair in given if pinned is None or not pinned[pair[1].row]]
-    if not lengthening:
-        return
-    boxes = np.array([one.box for _, one in lengthening])
-    extents = np.array([track.shown_extents(one.box) for track, one in lengthening])
-    whole = array.input.boxes.copy()
-    rows = [one.row for _, one in lengthening]
-    whole[rows] = lengthened(boxes, extents, sweep.origin - boxes[:, : Z + 1])
-    array.input = replace(array.input, boxes=whole)
-    for _, one in lengthening:
-        one.given, one.box = one.box, whole[one.row]
 
 
 def _windows(tracks: Sequence[ObservedTrack]) -> list[Window]:

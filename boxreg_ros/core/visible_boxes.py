@@ -125,34 +125,32 @@ def whole_extents(extents: Sequence[Floats], known: Floats | None) -> Floats:
     return found
 
 
-def lengthened(boxes: Floats, extents: Floats, to_sensor: Floats) -> Floats:
+def lengthened(box: Floats, extents: Floats, sensor: Floats) -> Floats:
     """
-    Return boxes that are not smaller than some extents, with the faces that are seen in place.
+    Return a box that is not smaller than some extents, with the faces that are seen in place.
 
     Parameters
     ----------
-    boxes : array, shape (n, 9)
+    box : array, shape (9,)
         In the fixed frame [m, rad].
-    extents : array, shape (n, 3)
+    extents : array, shape (3,)
         Least length, width and height [m].
-    to_sensor : array, shape (n, 3)
-        Position of the sensor minus the centre of each box, in the fixed frame [m]; NaN where it
-        is unknown.
+    sensor : array, shape (3,)
+        Position of the sensor in the fixed frame [m]; NaN where it is unknown.
 
     Returns
     -------
-    boxes : array, shape (n, 9)
+    box : array, shape (9,)
         Lengthened at the ends away from the sensor, at the top, and at both ends of an axis where
-        the sensor is between their planes, or unknown.
+        the sensor is between their planes, or unknown (M12b).
 
     """
-    found = boxes.copy()
-    own = boxes[:, BOX_EXTENT]
-    found[:, BOX_EXTENT] = np.maximum(own, extents)
-    R = matrix_from_rpy(boxes[:, ROLL:])
-    local = np.nan_to_num(np.einsum('nji,nj->ni', R, to_sensor))
+    found = box.copy()
+    own = box[BOX_EXTENT]
+    found[BOX_EXTENT] = np.maximum(own, extents)
+    R = matrix_from_rpy(box[ROLL:])
+    local = np.nan_to_num((sensor - box[BOX_CENTER]) @ R)
     side = np.sign(local) * (np.abs(local) > own / 2)
-    side[:, Z] = -1.0  # all stand on the road
-    shift = side * (found[:, BOX_EXTENT] - own) / 2
-    found[:, BOX_CENTER] -= np.einsum('nij,nj->ni', R, shift)
+    side[Z] = -1.0  # all stand on the road
+    found[BOX_CENTER] -= R @ (side * (found[BOX_EXTENT] - own) / 2)
     return found

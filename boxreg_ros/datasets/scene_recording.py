@@ -34,8 +34,8 @@ class SceneRecording:
     One sweep is in memory at a time. Sweeps that cannot be read are counted and left out. The
     LiDARs are by default the main one of the data set; `start` and `end` are counted from the
     first sweep [s]; with `labels`, a format and a path, the boxes are those of label files and
-    not the annotations; with `keyframes` boxes that no person made are left out, and rejected ones
-    but `with_rejected`. Entering raises RecordingError if the scene or a part of it is missing.
+    not the annotations; with `keyframes` boxes that no person made are left out, rejected ones are
+    unless `with_rejected`. Entering raises RecordingError if the scene or a part of it is missing.
 
     """
 

@@ -136,9 +136,10 @@ class _Tracks(Columns):
 
     def are_apart(self, centers: Floats, boxes: Floats) -> NDArray[np.bool_]:
         """
-        Return whether boxes (n, 9) and tracks at `centers` (K, 3) are apart, (n, K).
+        Return whether boxes (n, 9) are apart from tracks at `centers` (K, 3), (n, K).
 
-        Boxes of one object that hold what is seen of it change size, and overlap.
+        Boxes of clusters change size with what is seen of their object, and their centres move:
+        those of one object overlap.
 
         """
         away = np.linalg.norm(boxes[:, None, BOX_CENTER] - centers, axis=-1)
@@ -177,7 +178,7 @@ class Costs(NamedTuple):
     values: Floats
     """(n, tracks) squared distances in standard deviations."""
     is_apart: NDArray[np.bool_]
-    """(n, tracks), whether the centre of neither is in the other, by half of the longest side."""
+    """(n, tracks), whether their centres are half of the longest side, or more, apart."""
 
 
 class Tracker:

@@ -27,8 +27,8 @@ class LabelMerger:
     Boxes whose labels have poses in the sensor frame are taken in the frame of the clouds and move
     with the recording; the others are taken in the frame that the labels name. Boxes of the status
     ``human`` are pinned. The stamps of `frames` ascend; with `keyframes` boxes that no person made
-    are left out, and rejected ones but `with_rejected`. Where only a part of the recording, from
-    `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them;
+    are left out; rejected ones are, unless `with_rejected`. Where only a part of the recording,
+    from `start_ns` on, is read, boxes before and after it are left out, and `outside` counts them;
     `left_out` counts those that the frames lack, by reason; `notes` has what their reader assumed.
 
     Raises RecordingError if all labels are earlier than the clouds, or all later.

@@ -43,14 +43,16 @@ class LabelledRecording(Recording):
         super().__init__(paths, **options)
         self._labels = labels
         self._label_convention = convention
-        self._choice = keyframes, with_rejected
+        self._keyframes = keyframes
+        self._with_rejected = with_rejected
         self._is_part = any(options.get(name) is not None for name in ('start', 'end'))
 
     def items(self, tree: TransformTree, wanted: Wanted = EVERYTHING) -> Iterator[Item]:
         """Yield clouds and boxes; see `Recording.items`. Boxes have `Item.refined`."""
         frames = frames_of(*self._labels, convention=self._label_convention)
         sensor_frame, is_part = self.sensor_frame(), self._is_part
-        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, *self._choice)
+        choice = self._keyframes, self._with_rejected
+        merger = LabelMerger(frames, tree, sensor_frame, self.start_ns, is_part, *choice)
         for cloud in super().items(tree, wanted._replace(clouds=True)):
             if wanted.clouds:
                 yield cloud
@@ -129,7 +131,7 @@ def source_of(request: Request, with_rejected: bool = False) -> Recording | Scen
     """
     Return the recording or the scene of a data set that a request names, not yet open.
 
-    Labels are those of the files, rejected ones only `with_rejected`.
+    Rejected labels are left out unless `with_rejected`.
 
     """
     address = scene_address(request.recordings)

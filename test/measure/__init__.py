@@ -25,6 +25,7 @@ MEASUREMENTS = {
     'tracks': 'broken tracks before and after each completing step',
     'sensitivity': 'accuracy with each setting halved and doubled',
     'highway': 'accuracy at 5 and at 30 m/s, with boxes of either time',
+    'clusters': 'accuracy of boxes of clusters, which hold what is seen of an object',
     'points': 'labels of points against those of a simulation',
     'lidars': 'accuracy on a truck with LiDARs at its corners',
     'covariance': 'covariances against errors, by estimate and class',

@@ -19,6 +19,7 @@ from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.simulation.noise import detector_noise
 from boxreg_ros.simulation.scene import is_near, SimulatedScene
 from boxreg_ros.structures import (
+    BOX_CENTER,
     BOX_EXTENT,
     BoxArray,
     Floats,
@@ -28,11 +29,21 @@ from boxreg_ros.structures import (
     ROLL,
     Sweep,
     WIDTH,
+    YAW,
+    Z,
 )
 import numpy as np
 
 NEARBY_MARGIN = 1.0
 """Points up to this distance outside of a box are passed to the baselines [m]."""
+CLUSTER_MARGIN, CLUSTER_CLEARANCE = 0.15, 0.2
+"""Points of clusters are so far outside of a true box at most, and above its bottom [m]."""
+FEWEST_CLUSTERED = 8
+"""Fewer points are no cluster."""
+SHORTEST_SIDE = 0.1
+"""Of the box of a cluster [m]."""
+CLUSTER_YAW_ERROR = 3.0
+"""Standard deviation of its yaw [deg]."""
 
 
 class Drive(drive.Drive):
@@ -75,6 +86,22 @@ class Drive(drive.Drive):
             names = tuple(truth.class_names[row] for row in at)
             columns = tuple(ids[at].tolist()), names, np.ones(len(at)), boxes[at]
             arrays.append(BoxArray(stamp_ns, truth.frame_id, *columns))
+        return replace(self, boxes=tuple(arrays))
+
+    def clustered(self, seed: int = 0) -> Drive:
+        """Return the drive with boxes of clusters: each around the points in a true one."""
+        truth, rng = self.truth, np.random.default_rng(seed)
+        boxes, arrays = truth.boxes.copy(), []
+        boxes[:, YAW] += np.radians(CLUSTER_YAW_ERROR) * rng.standard_normal(len(boxes))
+        for sweep in self.sweeps:
+            points = sweep.in_frame().points
+            at = np.flatnonzero(truth.stamps_ns == sweep.stamp_ns).tolist()
+            found = {row: _cluster(points, truth.boxes[row], boxes[row]) for row in at}
+            at = [row for row in at if found[row] is not None]
+            names = tuple(truth.track_ids[row] for row in at)
+            columns = names, tuple(truth.class_names[row] for row in at), np.ones(len(at))
+            of_sweep = np.reshape([found[row] for row in at], (-1, 9))
+            arrays.append(BoxArray(sweep.stamp_ns, truth.frame_id, *columns, of_sweep))
         return replace(self, boxes=tuple(arrays))
 
     def registered(self, config: Config) -> dict[str, BoxTable]:
@@ -132,6 +159,24 @@ class Drive(drive.Drive):
                 for sweep, center in zip(near, centers, strict=True)
             ]
         )
+
+
+def _cluster(points: Floats, truth: Floats, axes: Floats) -> Floats | None:
+    """Return the box (9,) on the road around the points in a true one, by the axes of another."""
+    half = truth[BOX_EXTENT] / 2
+    local = (points - truth[BOX_CENTER]) @ matrix_from_rpy(truth[ROLL:])
+    inside = (np.abs(local) <= half + CLUSTER_MARGIN).all(1)
+    of_object = points[inside & (local[:, Z] > CLUSTER_CLEARANCE - half[Z])]
+    if len(of_object) < FEWEST_CLUSTERED:
+        return None
+    R = matrix_from_rpy(axes[ROLL:])
+    local = (of_object - truth[BOX_CENTER]) @ R
+    low, high = local.min(0), local.max(0)
+    low[Z] = -half[Z]
+    box = axes.copy()
+    box[BOX_CENTER] = truth[BOX_CENTER] + R @ ((low + high) / 2)
+    box[BOX_EXTENT] = (high - low).clip(SHORTEST_SIDE)
+    return box
 
 
 def _nearby(sweep: Sweep, box: Floats) -> Ints:
