@@ -26,7 +26,8 @@ import numpy as np
 
 # All of these are chosen, except where an origin stands beside them.
 NOTABLE = 0.05
-"""Less is neither corrected nor a warning [s]: without latency, estimates err by up to 0.04 s."""
+"""Less is neither corrected nor a warning [s]: without latency, estimates err by up to 0.04 s;
+but where boxes have a steady offset from their sweeps that agrees."""
 CANDIDATES = np.arange(-0.4, 0.801, 0.05)
 """Latencies that are compared [s]; negative ones are of boxes that are predicted too far."""
 ENDS = np.array([0, len(CANDIDATES) - 1])
@@ -60,6 +61,8 @@ FULL_WEIGHT = 5
 """Comparisons by which a track has its whole weight."""
 OBJECTS_COMPARED = 16
 """Objects of a sweep that are compared, of more those that were compared least often."""
+STEADY_SPREAD = 0.005
+"""Stamps of boxes are steadily off their sweeps where four of five are within so much [s]."""
 MAX_SAMPLES = 600
 """Comparisons that are kept: the newest, so that the estimate follows a latency that changes."""
 TRACK_SECONDS = 3.0
@@ -82,7 +85,7 @@ class Latency(NamedTuple):
 
     seconds: float = 0.0
     """By which the boxes are corrected; 0 where the evidence is too weak, or it is below
-    `NOTABLE`."""
+    `NOTABLE` and not the offset of the boxes from their sweeps."""
     finding: str = ''
     """Why it could not be estimated; empty where it could."""
     estimated: float | None = None
@@ -107,7 +110,7 @@ class Latency(NamedTuple):
                 f'boxes are {abs(self.estimated):.1f} s {word} or more, which is not corrected: '
                 f'correct the stamps where they are made, or set sampling.box_time'
             )
-        if not (self.drifts or abs(self.seconds) >= NOTABLE):
+        if not (self.drifts or self.seconds):
             return ''
         changes = ', at the end of a latency that drifts' if self.drifts else ''
         return (
@@ -200,6 +203,8 @@ class LatencyEvidence:
 
     def __init__(self) -> None:
         self._samples = deque[_Sample](maxlen=MAX_SAMPLES)
+        # Stamps [ns] of boxes, and of their sweeps.
+        self._stamps = deque[tuple[int, int]](maxlen=MAX_SAMPLES)
         self._has_new_samples = False
         self._latency = Latency(finding=NOTHING_MOVES)
         self.restart()
@@ -214,6 +219,10 @@ class LatencyEvidence:
         if not sweep.is_dropped and sweep.stamp_ns >= self._sampled_ns + SAMPLE_PERIOD * 1e9:
             self._sampled_ns = sweep.stamp_ns
             self._sweeps.append(sweep)
+
+    def add_stamps(self, boxes_ns: int, sweep_ns: int) -> None:
+        """Add the stamps of boxes and of their sweep [ns]."""
+        self._stamps.append((boxes_ns, sweep_ns))
 
     def compare(self, tracks: MeasuredTracks) -> None:
         """Compare the sweeps whose later boxes are among the tracks."""
@@ -237,11 +246,34 @@ class LatencyEvidence:
             found = _estimated(known)
             # Where nothing was or is corrected, a few objects erred for a while.
             drifts |= is_new and bool(self._latency.seconds or found.seconds)
-            found = found._replace(drifts=drifts)
+            found = _as_stamped(found, self._steady_offsets())._replace(drifts=drifts)
             if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
             self._latency = found
         return self._latency
+
+    def _steady_offsets(self) -> Floats:
+        """
+        Return by how much boxes may be stamped behind their sweeps [s], ascending.
+
+        By the nearest sweeps, and by those so many periods before and behind them as are
+        compared. Empty if it is no steady time.
+
+        """
+        boxes_ns, sweeps_ns = np.array(self._stamps, np.int64).reshape(-1, 2).T
+        steps = np.diff(np.unique(sweeps_ns))
+        if not len(steps):
+            return np.empty(0)
+        period = float(np.median(steps)) * 1e-9
+        offsets = (boxes_ns - sweeps_ns) * 1e-9
+        # Of half a period, either sweep may be the nearest one.
+        offsets = offsets[0] + np.remainder(offsets - offsets[0] + period / 2, period) - period / 2
+        low, middle, high = np.quantile(offsets, (0.1, 0.5, 0.9))
+        if high - low > STEADY_SPREAD:
+            return np.empty(0)
+        first, last = np.ceil((CANDIDATES[ENDS] - middle) / period)
+        found: Floats = middle + period * np.arange(first, last)
+        return found
 
     def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
@@ -325,7 +357,7 @@ class LatencyCorrection:
         for pair in pairs:
             self._waiting.append(pair)
             if not pair.reason:
-                self._note(pair.boxes)
+                self._note(pair)
             if self._waits:
                 self._compare()
             yield from self._ready()
@@ -337,8 +369,11 @@ class LatencyCorrection:
         while self._waiting:
             yield self._pop_corrected()
 
-    def _note(self, boxes: BoxArray) -> None:
-        """Add boxes to their tracks."""
+    def _note(self, pair: Pair) -> None:
+        """Add boxes to their tracks, and how they are stamped."""
+        boxes = pair.boxes
+        if pair.sweep is not None:
+            self._evidence.add_stamps(boxes.stamp_ns, pair.sweep.stamp_ns)
         if self._first_ns is None:
             self._first_ns = boxes.stamp_ns
         if self._is_estimated or self.latency.seconds:
@@ -472,6 +507,29 @@ def _estimated(known: _Comparisons) -> Latency:
             finding=f'the latency of the boxes is not known: {estimated:.2f} s with a deviation '
             f'of {deviation:.2f} s, by {n} moving objects'
         )
+    return found
+
+
+def _as_stamped(found: Latency, offsets: Floats) -> Latency:
+    """
+    Return a latency as the one of some `offsets` (n,) [s] of the stamps that it agrees with.
+
+    Boxes of a sweep that are stamped off it by a steady time are late by exactly that. One below
+    `NOTABLE`, which the points alone do not show, is corrected where they speak for it.
+
+    """
+    if found.estimated is None or found.deviation is None or not len(offsets):
+        return found
+    offset = float(offsets[np.abs(offsets - found.estimated).argmin()])
+    errors = np.array([found.estimated, found.estimated - offset]) / found.deviation
+    in_time, as_stamped = np.square(errors).tolist()
+    is_known = bool(found.seconds) or (
+        abs(found.estimated) < NOTABLE
+        and found.deviation <= USABLE_DEVIATION
+        and in_time - as_stamped >= GAIN**2
+    )
+    if is_known and abs(offset) >= STEP and as_stamped <= SIGNIFICANCE**2:
+        return found._replace(seconds=offset)
     return found
 
 

@@ -32,9 +32,11 @@ def late(boxes, seconds):
 def shown(sweeps, boxes):
     """Yield the latency that a stream shows with each box array."""
     correction = LatencyCorrection(waits=False)
+    stamps_ns = np.array([sweep.stamp_ns for sweep in sweeps])
     for item in sorted([*sweeps, *boxes], key=lambda item: item.stamp_ns):
         if isinstance(item, BoxArray):
-            list(correction.add([Pair(item, None)], Config()))
+            nearest = sweeps[int(np.abs(stamps_ns - item.stamp_ns).argmin())]
+            list(correction.add([Pair(item, nearest)], Config()))
             yield correction.latency
         else:
             correction.add_sweep(item)
@@ -60,6 +62,23 @@ def test_one_latency_is_found_and_none_where_there_is_none(sample_drive):
         corrected = 0.0 if abs(seconds) < NOTABLE else found.estimated
         assert found.seconds == pytest.approx(corrected, abs=STEP)
         assert bool(found.warning) == (abs(seconds) > NOTABLE)
+
+
+@pytest.mark.parametrize('seconds', [0.03, 0.05, -0.04, -0.05])
+def test_boxes_stamped_steadily_off_their_sweeps_are_late_by_exactly_that(sample_drive, seconds):
+    found = estimated(sample_drive.sweeps, late(sample_drive.boxes, seconds))
+    assert found.seconds == pytest.approx(seconds, abs=0.002)
+    assert f'boxes are {abs(seconds):.2f} s {"late" if seconds > 0 else "early"}' in found.warning
+
+
+@pytest.mark.parametrize('seconds', [0.03, -0.03, 0.05])
+def test_boxes_of_their_stamps_are_in_time_wherever_the_sweeps_are(sample_drive, seconds):
+    sweeps, boxes = sample_drive.sweeps, sample_drive.boxes
+    tracks = latency.MeasuredTracks(latency.CANDIDATES)
+    for array in boxes:
+        tracks.add(array, 0)
+    moved = [replace(array, boxes=tracks.at_stamp(array, -seconds)) for array in boxes]
+    assert estimated(sweeps, late(moved, -seconds)).seconds == 0
 
 
 @pytest.mark.parametrize('seconds, words', [(-0.6, '0.4 s early'), (1.0, '0.8 s late')])
