@@ -109,6 +109,7 @@ class FixedFrameItems:
             if confirmed.has_jumped:
                 yield from map(self._merged, self.session.unmerged())
                 # The tree, which is ahead of the items, has detected the jump itself.
+                self.tree.forget_before()
                 self.session.restart()
                 self.counts[Reason.TIME_JUMP] += 1
                 self._restarts = True

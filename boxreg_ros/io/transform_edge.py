@@ -126,6 +126,7 @@ class Edge:
         self._clock = StreamClock()
         self._ahead: tuple[int, Pose, int | None] | None = None
         self._was_forgotten = False
+        self._before: Edge | None = None  # samples before time went back, see `forget_before`
         self._last_added: tuple[int, Floats] | None = None
         # A cloud, its boxes and its label files ask for the same stamp; of a static pair any.
         self._last_found: tuple[int, Floats] | None = None
@@ -199,6 +200,7 @@ class Edge:
         is_old = self._is_old(stamp_ns)
         has_jumped = self.jumps_to(stamp_ns)
         if has_jumped:
+            self._keep_before(stamp_ns)
             self._forget()
             self._was_forgotten = True
             if before is not None and abs(before[0] - stamp_ns) <= round(TIME_JUMP * 1e9):
@@ -222,8 +224,28 @@ class Edge:
         """Return whether a sample of a stamp is a time jump back: a single old one is none."""
         return self._was_old and self._is_old(stamp_ns)
 
+    def _keep_before(self, stamp_ns: int) -> None:
+        """Keep the samples behind a stamp that time goes back to, for clouds and boxes of then."""
+        first = bisect_right(self.stamps, stamp_ns + round(TIME_JUMP * 1e9))
+        self._before = Edge(self.parent, self.child, self._buffer_ns)
+        self._before.stamps, self._before.poses = self.stamps[first:], self.poses[first:]
+
+    def forget_before(self) -> None:
+        """Forget the samples before time went back: clouds and boxes have gone back, too."""
+        self._before = None
+        self._last_found = None
+
+    def _known_before(self, stamp_ns: int) -> Edge | None:
+        """Return the samples before time went back, if a stamp is of then; else None."""
+        jump_ns = round(TIME_JUMP * 1e9)
+        before = self._before
+        if before is None or (self.stamps and stamp_ns <= self.stamps[-1] + jump_ns):
+            return None
+        return before if before.stamps[0] <= stamp_ns <= before.stamps[-1] + jump_ns else None
+
     def rewind(self, stamp_ns: int) -> None:
         """Forget later samples; at 0 the recording is read again."""
+        self.forget_before()
         newest_ns = stamp_ns + round(TIME_JUMP * 1e9)
         if stamp_ns <= 0 and self.may_be_constant:
             return  # published once: where the recording is read again, it is known from its begin
@@ -257,7 +279,18 @@ class Edge:
         self._confirm(stamp_ns)
         if self.is_static:
             return bool(self.stamps)
-        return bool(self.stamps) and self.stamps[0] <= stamp_ns <= self.stamps[-1]
+        stamps = (self._known_before(stamp_ns) or self).stamps
+        return bool(stamps) and stamps[0] <= stamp_ns <= stamps[-1]
+
+    def is_final(self, stamp_ns: int) -> bool:
+        """
+        Return whether no later sample changes the pose at a stamp.
+
+        It is between samples, before the first ones, or of the time before a jump.
+
+        """
+        is_first = len(self.stamps) > 1 and stamp_ns < self.stamps[0]
+        return is_first or self._known_before(stamp_ns) is not None or self.covers(stamp_ns)
 
     def at(self, stamp_ns: int, is_constant: bool = False) -> Floats:
         """
@@ -290,6 +323,9 @@ class Edge:
         return found[1]
 
     def _at(self, stamp_ns: int) -> Floats:
+        before = self._known_before(stamp_ns)
+        if before is not None:
+            return before._at(stamp_ns)
         stamps = self.stamps
         if not stamps:
             cause = 'all poses are NaN or have no orientation; check its publisher'
@@ -354,6 +390,8 @@ class Edge:
         """
         if self.is_static or is_constant:
             return self.at(stamps_ns[0], is_constant)
+        if self._before is not None:
+            return np.array([self._at(one) for one in stamps_ns])
         known = self.stamps
         after = [min(max(bisect_left(known, one), 1), len(known) - 1) for one in stamps_ns]
         gaps_ns = [known[row] - known[row - 1] for row in after]

@@ -65,7 +65,8 @@ class TransformTree:
     Frames and the transforms between them, looked up by integer stamp.
 
     State: per pair of parent and child, one static transform or the samples of the last
-    `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones. Between
+    `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones, which are
+    kept for stamps more than `TIME_JUMP` ahead of these until `forget_before` or `rewind`. Between
     samples, positions are interpolated linearly and orientations along the shortest rotation, as
     tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples
     on each side. Up to `MAX_EXTRAPOLATION` outside of them the motion is extrapolated. A
@@ -194,6 +195,11 @@ class TransformTree:
         for edge in _edges_of((*self._tf.values(), *self._odometry.values())):
             edge.rewind(stamp_ns)
 
+    def forget_before(self) -> None:
+        """Forget samples before time went back: clouds and boxes have gone back, too."""
+        for edge in _edges_of((*self._tf.values(), *self._odometry.values())):
+            edge.forget_before()
+
     def newest_ns(self) -> int | None:
         """Return the newest stamp of all moving frames [ns]; None if there are none."""
         return max(
@@ -313,6 +319,23 @@ class TransformTree:
         """
         return self.connects(target, source) and all(
             self._is_once(edge) or edge.covers(stamp_ns) for edge, _ in self._route(target, source)
+        )
+
+    def is_final(self, target: str, source: str, stamp_ns: int) -> bool:
+        """
+        Return whether later transforms, which come in order, change nothing of `lookup`.
+
+        Parameters
+        ----------
+        target, source : str
+            As of `lookup`.
+        stamp_ns : int
+            [ns].
+
+        """
+        return self.connects(target, source) and all(
+            self._is_once(edge) or edge.is_final(stamp_ns)
+            for edge, _ in self._route(target, source)
         )
 
     def route(self, target: str, source: str) -> list[Edge]:

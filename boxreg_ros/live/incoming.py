@@ -50,16 +50,19 @@ class Incoming:
         for whole in self._bursts.add(item) if is_boxes else [item]:
             yield self._jumps.add(whole, whole.content, whole.received_ns)
 
-    def release(self, now: float = inf, more_boxes: bool = False) -> Iterator[Confirmed[Item]]:
+    def release(
+        self, now: float = inf, more_boxes: bool = False, more: bool = False
+    ) -> Iterator[Confirmed[Item]]:
         """
         Yield what no other message has confirmed in time [s]: late ones, and those not to use.
 
-        While there are `more_boxes`, those that wait for others of their stamp wait on.
+        While there are `more_boxes`, those that wait for others of their stamp wait on; while
+        there are `more` messages of any kind, those that one of them may confirm.
 
         """
         for whole in [] if more_boxes else self._bursts.release(now):
             yield self._jumps.add(whole, whole.content, whole.received_ns)
-        for held in self._jumps.held:
+        for held in [] if more else self._jumps.held:
             if now >= held.item.received + _patience(held):
                 released = self._jumps.release(held)
                 yield Confirmed(ahead=released) if held.is_ahead else Confirmed(released)

@@ -131,10 +131,10 @@ class MessagePipeline:
         return self._confirmed(self.incoming.add(item))
 
     def release(
-        self, now: float = inf, more_boxes: bool = False
+        self, now: float = inf, more_boxes: bool = False, more: bool = False
     ) -> tuple[list[Item], list[Outgoing]]:
         """Return what no other message has confirmed in time, see `Incoming`."""
-        return self._confirmed(self.incoming.release(now, more_boxes))
+        return self._confirmed(self.incoming.release(now, more_boxes, more))
 
     def process(self, item: Item) -> list[Outgoing]:
         """Take a message to the registrar; return the messages that are ready to be published."""

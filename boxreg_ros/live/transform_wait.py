@@ -65,10 +65,10 @@ class TransformWait:
         stamp_ns = content.stamp_ns
         if isinstance(content, Sweep):
             stamp_ns = session.placement.last_stamp_ns(content)
-        is_covered = session.tree.covers(fixed_frame, content.frame_id, stamp_ns)
-        if is_covered and self.changes_frame(content):
-            return session.tree.covers(self.output_frame, fixed_frame, content.stamp_ns)
-        return is_covered
+        is_final = session.tree.is_final(fixed_frame, content.frame_id, stamp_ns)
+        if is_final and self.changes_frame(content):
+            return session.tree.is_final(self.output_frame, fixed_frame, content.stamp_ns)
+        return is_final
 
     def _is_unknown(self, sweep: Sweep) -> bool:
         """Return whether one of several LiDARs still has no transform after one timeout."""

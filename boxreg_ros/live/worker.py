@@ -218,8 +218,9 @@ class Worker:
 
     def _next(self) -> Item | None:
         """Return the next message decoded, or None if there is none to process now."""
-        more_boxes = self._inbox.sizes()['boxes_waiting'] > 0
-        late, ready = self._live.release(time.monotonic(), more_boxes)
+        waiting = self._inbox.sizes()
+        more_boxes = waiting['boxes_waiting'] > 0
+        late, ready = self._live.release(time.monotonic(), more_boxes, any(waiting.values()))
         self._confirmed.extend(late)
         self._publish(ready)
         if not self._confirmed:

@@ -384,6 +384,12 @@ def test_samples_after_a_time_jump_replace_the_old_ones():
     np.testing.assert_allclose(
         T[:3, 3], [0, 2.5, 2]
     )  # of the second pass; the static transform is kept
+    # Clouds and boxes of the first pass may come behind; by a second at most, none is awaited.
+    np.testing.assert_allclose(tree.lookup('odom', 'lidar', 102 * S)[0, 3], 20)
+    stamps = [95, 101, 102, 104.9, 105.5, 106]
+    final = [tree.is_final('odom', 'lidar', round(stamp * S)) for stamp in stamps]
+    assert final == [True, False, True, True, True, False]
+    tree.forget_before()
     assert not tree.covers('odom', 'lidar', 102 * S)
     assert not tree.covers('odom', 'lidar', 95 * S)
     tree.rewind(98 * S)

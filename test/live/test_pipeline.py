@@ -1,5 +1,7 @@
 """The driver of the node, without ROS: waiting, transforms, unchanged boxes, restarts."""
 
+from dataclasses import replace
+
 from boxreg_ros.config import Config
 from boxreg_ros.core.registrar import BoxRegistrar
 from boxreg_ros.io.items import Item
@@ -238,6 +240,9 @@ def test_messages_wait_for_their_transforms_until_the_timeout():
     assert live.wait.is_over(clouds[2], 11.0)  # timeout: extrapolated by 0.1 s
     assert live.process(clouds[2]) == []
     assert not live.reports
+    early = received('/points', clouds[0].message, 11.0)
+    early = early._replace(content=replace(early.content, stamp_ns=early.content.stamp_ns - 1))
+    assert live.wait.is_over(early, 11.0)  # no transform before the first ones will come
 
 
 def test_final_boxes_keep_the_input_order_with_unchanged_ones_between():
@@ -428,6 +433,18 @@ def test_tracks_restart_at_a_time_jump(back):
         sensor = np.array([0.5 * drive.stamps.index(stamp_ns), 0, 2.0])
         assert item.refined.status == (REFINED,) * 2
         assert np.abs(array.boxes[:, :3] + sensor - drive.truth[stamp_ns][:, :3]).max() < 0.3
+
+
+def test_a_time_jump_is_found_among_messages_that_have_waited_for_long():
+    live = Live(timeout=0.4)
+    first = Drive(sweeps=20)
+    live.feed(moved(first, 60))
+    old, confirming = items_of(Drive(sweeps=2), '/boxes')
+    assert live.confirm(received('/boxes', old)) == ([], [])
+    assert live.release(10.0, more=True) == ([], [])
+    items, _ = live.confirm(received('/boxes', confirming))
+    assert [item.message for item in items] == [old, confirming]
+    assert [reason for reason, _, _ in live.reports] == ['time_jump']
 
 
 @pytest.mark.parametrize('topic', ['/boxes', '/points'])
