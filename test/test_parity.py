@@ -349,6 +349,18 @@ def assert_same_velocities(messages, type_name, path):
     assert compared == len(known)
 
 
+def test_missing_ids_are_assigned_by_node_and_relabel(tmp_path):
+    drive = Drive(sweeps=8)
+    for message in [message for topic, _, message in drive.items if topic == '/boxes']:
+        for detection in message.detections:
+            detection.id = ''
+    path = drive.write(tmp_path / 'drive')
+    expected = relabelled(path, tmp_path / 'out')
+    assert {track_id for _, track_id in expected} == {'1', '2'}
+    final = final_of_node(tmp_path, records_of(path))
+    assert_equal_boxes(as_published(final, DETECTIONS), expected)
+
+
 def test_boxes_without_ids_are_refused_by_node_and_relabel(tmp_path, capsys):
     path = Drive(sweeps=2, boxes=JSK).write(tmp_path / 'drive')
     assert main(['relabel', str(path), '-o', str(tmp_path / 'out')]) == 1

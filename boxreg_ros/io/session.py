@@ -41,6 +41,9 @@ BOXES_WITHOUT_FRAME = (
     'boxes have an empty frame_id: expected the name of their frame; they are taken to be in that '
     'of the clouds, {!r}'
 )
+BOXES_WITHOUT_IDS = (
+    'no box has a track id: boxes are associated over time; set associate:=true to confirm that'
+)
 SAME_FRAMES = (
     'frames: expected one name for each, got names that differ by a prefix alone: {}; each pair '
     'is taken for one frame, since nothing else connects them'
@@ -76,6 +79,8 @@ class Session:
         self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
+        self.assigns_missing_ids = False  # to all boxes, while none has had an id
+        self._has_ids = self._has_assigned = False
         lidars = self.placement.lidars
         self._merger: SweepMerger | None = None
         if len(lidars.topics) > 1:
@@ -130,12 +135,19 @@ class Session:
             motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
             moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
             self._tracker.max_gap = self.config.max_gap  # which may change
-            if self._id_check is None:
+            if self._id_check is None or self._lacks_ids(moved):
                 moved = self._tracker.identify(moved)
             else:
                 self._id_check.add(moved)
         self._checks.add(given, moved, T_fixed_item, self.sensor_frame, self._tracker)
         return item._replace(moved=moved, T_fixed_item=T_fixed_item, reason=reason, detail=detail)
+
+    def _lacks_ids(self, boxes: BoxArray) -> bool:
+        """Return whether boxes are associated, since none has had an id so far."""
+        self._has_ids |= any(boxes.track_ids)
+        is_assigned = self.assigns_missing_ids and not self._has_ids and bool(boxes.track_ids)
+        self._has_assigned |= is_assigned
+        return is_assigned
 
     def _name_odometry_child(self) -> None:
         """Take odometry without a child frame for that of the vehicle, if no motion is known."""
@@ -231,6 +243,7 @@ class Session:
             (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
             (Reason.TRANSFORM_FAULT, odometry),
+            (Reason.TRACK_IDS_JUMP, BOXES_WITHOUT_IDS if self._has_assigned else ''),
             (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
         ]
         found = [Finding(reason, text) for reason, text in texts if text]
@@ -251,7 +264,7 @@ class Session:
     @property
     def facts(self) -> dict[str, object]:
         """Return the origin of the ids, for reports."""
-        if self._id_check is not None:
+        if self._id_check is not None and not self._has_assigned:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 
