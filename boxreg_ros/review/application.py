@@ -298,7 +298,8 @@ class Review:
     def _append(self, new: list[Decision], seen: object) -> Response:
         with self._log_lock, self._log.locked():
             count = len(self._log.decisions)
-            first = seen if isinstance(seen, int) and 0 <= seen <= count else 0
+            known = seen if isinstance(seen, int) and seen >= 0 else 0
+            first = known if known <= count else 0
             tracks = {one.track_id for one in new}
             missed = [one for one in self._log.decisions[first:] if one.track_id in tracks]
             if missed:
@@ -307,14 +308,14 @@ class Review:
                     f'{last.who or "another person"} has decided about track '
                     f'{last.track_id!r:.80} meanwhile ({last.kind}): look, then decide again'
                 )
-                return JSONResponse({**self._since(first), 'message': text}, 409)
+                return JSONResponse({**self._since(first, known), 'message': text}, 409)
             self._log.append_locked(new)
-        return JSONResponse(self._since(first))
+        return JSONResponse(self._since(first, known))
 
-    def _since(self, first: int) -> dict[str, Any]:
-        """Return the decisions from `first` on, as the page receives them."""
+    def _since(self, first: int, known: int = 0) -> dict[str, Any]:
+        """Return the decisions from `first` on to a page that had `known` ones of the file."""
         rows = [one.as_json() for one in self._log.decisions[first:]]
-        return {'first': first, 'rows': rows}
+        return {'first': first, 'rows': rows, 'is_replaced': known > first}
 
     async def _stream(self, seen: int) -> AsyncIterator[bytes]:
         yield b'retry: 1000\n\n'
@@ -331,8 +332,8 @@ class Review:
                 await run_in_threadpool(self._refresh)
                 if len(self._log.decisions) != seen:
                     first = seen if seen < len(self._log.decisions) else 0
+                    data = orjson.dumps(self._since(first, seen)).decode()
                     seen = len(self._log.decisions)
-                    data = orjson.dumps(self._since(first)).decode()
                     yield f'id: {seen}\ndata: {data}\n\n'.encode()
                 await anyio.sleep(POLL_SECONDS)
         finally:

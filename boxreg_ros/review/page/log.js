@@ -31,8 +31,8 @@ function covering(topic, input, stamp) {
   return (log.ofInput.get(input) ?? []).filter(row => TOPIC_OF[row.decision] === topic && covers(row, stamp));
 }
 
-function receive({ first, rows }) {
-  if (first === 0 && rows.length < log.count) forget();  // the file was replaced
+function receive({ first, rows, is_replaced: isReplaced = false }) {
+  if (isReplaced) forget();  // the file was; fewer rows than are known may be those of an event that came late
   const fresh = rows.slice(log.count - first);
   if (!fresh.length) return;
   log.count = first + rows.length;
