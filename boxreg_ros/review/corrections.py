@@ -9,7 +9,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
 from boxreg_ros.reasons import Reason
-from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope, TOPIC_OF
+from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope, TOPIC_OF, WITH_BOX
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -206,8 +206,8 @@ class Corrections:
         """
         found = self._judgement(input_id, stamp_ns)
         is_rejected = found is not None and found.kind == 'reject'
-        is_deleted = self._last('deletion', input_id, stamp_ns) is not None
-        return is_rejected or is_deleted or (input_id, stamp_ns) in self._rejected
+        is_left_out = is_rejected or self._is_deleted(input_id, stamp_ns)
+        return is_left_out or (input_id, stamp_ns) in self._rejected
 
     def is_accepted(self, input_id: str, stamp_ns: int) -> bool:
         """Return whether a box is accepted or pinned."""
@@ -216,7 +216,7 @@ class Corrections:
 
     def pin(self, input_id: str, stamp_ns: int) -> Floats | None:
         """Return the box (9,) of a pin where the input has none; None for no pin."""
-        if (input_id, stamp_ns) in self._boxes:
+        if (input_id, stamp_ns) in self._boxes or self._is_deleted(input_id, stamp_ns):
             return None
         found = self._judgement(input_id, stamp_ns)
         return found.box if found is not None and found.kind == 'pin' else None
@@ -530,7 +530,7 @@ class Corrections:
         return [
             row
             for row, track_id in enumerate(given.track_ids)
-            if self._last('deletion', track_id, given.stamp_ns) is None
+            if not self._is_deleted(track_id, given.stamp_ns)
         ]
 
     def _renamed(self, given: BoxArray) -> BoxArray:
@@ -557,10 +557,16 @@ class Corrections:
         gone = self._renamed(given.plain()).take(deleted)
         return with_rejected(refined, gone, deleted, [Reason.DELETED] * len(deleted))
 
+    def _is_deleted(self, track_id: str, stamp_ns: int) -> bool:
+        """Return whether a box is deleted, and a person has set none in its place since."""
+        found = self._covering(('deletion', 'judgement', 'addition'), track_id, stamp_ns)
+        words = [one.kind for one in found if one.kind in ('delete', *WITH_BOX)]
+        return words[-1:] == ['delete']
+
     def _judgement(self, track_id: str, stamp_ns: int) -> Decision | None:
         """Return the judgement of a box: its own, else that of a range, else of its track."""
         found = None
-        for one in self._covering('judgement', track_id, stamp_ns):
+        for one in self._covering(('judgement',), track_id, stamp_ns):
             if found is None or _closeness(one) >= _closeness(found):
                 found = one
         return found
@@ -571,14 +577,14 @@ class Corrections:
 
     def _last(self, topic: str, track_id: str, stamp_ns: int) -> Decision | None:
         """Return the last decision of a topic about a box."""
-        return next(reversed(self._covering(topic, track_id, stamp_ns)), None)
+        return next(reversed(self._covering((topic,), track_id, stamp_ns)), None)
 
-    def _covering(self, topic: str, track_id: str, stamp_ns: int) -> list[Decision]:
-        """Return the decisions of a topic about a box, in their order."""
+    def _covering(self, topics: Collection[str], track_id: str, stamp_ns: int) -> list[Decision]:
+        """Return the decisions of some topics about a box, in their order."""
         found = [
             one
             for one in self._of_track.get(track_id, ())
-            if one.topic == topic and not one.is_taken_back and one.covers(stamp_ns)
+            if one.topic in topics and not one.is_taken_back and one.covers(stamp_ns)
         ]
         self._unused -= {one.scope for one in found}
         return found

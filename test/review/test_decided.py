@@ -134,7 +134,7 @@ def test_decisions_bind_the_steps_of_complete(completed, tmp_path, capsys):
     decisions = [
         Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2'),
         Decision('2', stamps[1], 'reclass', end_ns=stamps[2], value='truck'),
-        Decision('2', stamps[4], 'delete'),  # added in the gap
+        Decision('2', stamps[4], 'delete', end_ns=stamps[5]),  # added in the gap
         Decision('2', stamps[5], 'pin', '', table.frame_id, pin),  # likewise
         Decision('1', stamps[3], 'delete', end_ns=stamps[5]),  # inside of the track
         Decision('1', stamps[14], 'delete', end_ns=stamps[15]),  # added at its end
@@ -219,6 +219,7 @@ def corrected_by_file(followed, folder):
     pin = table.boxes[list(keys).index(('1', stamps[6]))] + [0.2, 0, 0, 0, 0, 0, 0, 0, 0]
     decisions = [
         Decision('2', stamps[6], 'rename', end_ns=stamps[-1], value='2_2'),
+        Decision('1', stamps[2], 'pin', '', table.frame_id, pin),
         Decision('1', stamps[2], 'delete'),
         Decision('1', stamps[6], 'pin', '', table.frame_id, pin),
     ]
@@ -322,10 +323,11 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
         open_box(page, '2', 4)  # added in the gap
         press(page, 'Shift+D', 'current().deleted === 1')
         open_box(page, '2', 5)
-        page.keyboard.press('e')
+        press(page, 'Shift+D', 'current().deleted === 2')
+        page.keyboard.press('e')  # set by hand, it is there again
         page.keyboard.press('ArrowUp')
         corrected = page.evaluate('moved(view.edit, view.part.origin, 1)')
-        press(page, 'Enter', 'pinOf(view.row) !== null')
+        press(page, 'Enter', 'pinOf(view.row) !== null && current().deleted === 1')
         open_box(page, '2', 1)
         page.keyboard.press('b')
         page.evaluate('step(2)')
@@ -333,7 +335,7 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
         page.wait_for_selector('#ask[open]')
         page.fill('#ask-text', 'truck')
         page.keyboard.press('Enter')
-        page.wait_for_function('log.made.length === 8')
+        page.wait_for_function('log.made.length === 9')
         open_box(page, '2', 10)
         press(page, 's', "current().id === '2_2'")
         open_box(page, '2_2', 4)

@@ -9,7 +9,8 @@ const cached = new Map();
 const inputOf = (s, k) => { const { inputs, owners } = DATA.tracks[s]; return inputs[owners ? owners[k] : 0] ?? DATA.tracks[s].id; };
 const stampOf = (s, k) => DATA.stamps[DATA.tracks[s].at[k]];
 const decidedValue = (topic, s, k) => covering(topic, inputOf(s, k), stampOf(s, k)).at(-1)?.value;
-const isDeleted = (s, k) => covering('deletion', inputOf(s, k), stampOf(s, k)).length > 0;
+// A box that a person has set where one was deleted is there again.
+const isDeleted = (s, k) => (log.ofInput.get(inputOf(s, k)) ?? []).filter(row => ['delete', 'pin', 'add'].includes(row.decision) && covers(row, stampOf(s, k))).at(-1)?.decision === 'delete';
 
 function buildTracks() {
   const groups = new Map();
@@ -39,14 +40,14 @@ function rowsById(source, s) {
 function trackOf(id, pieces, index) {
   const sources = pieces.map(({ s }) => DATA.tracks[s]);
   const riskiest = sources.reduce((a, b) => (b.risk > a.risk ? b : a));
-  const track = { ...riskiest, id, pieces, index, rank: index + 1, isWhole: pieces.length === 1 && pieces[0].rows === null };
+  const track = { ...riskiest, id, pieces, index, rank: index + 1, isWhole: pieces.length === 1 && pieces[0].rows === null,
+                  get deleted() { return topics.has('deletion') ? this.members().filter(([s, k]) => isDeleted(s, k)).length : 0; } };
   let boxes;
   track.members = () => boxes ??= pieces.flatMap(({ s, rows }) => (rows ?? DATA.tracks[s].at.map((_, k) => k)).map(k => [s, k]))
     .sort(([s, k], [t, l]) => DATA.tracks[s].at[k] - DATA.tracks[t].at[l]);
   const inputs = new Set(sources.flatMap(source => source.inputs));
   const topics = new Set([...inputs].flatMap(input => (log.ofInput.get(input) ?? []).map(row => TOPIC_OF[row.decision])));
   if (topics.has('class')) track.class = decidedValue('class', ...track.members()[0]) ?? track.class;
-  track.deleted = topics.has('deletion') ? track.members().filter(([s, k]) => isDeleted(s, k)).length : 0;
   if (!track.isWhole) {
     const times = track.members().map(([s, k]) => DATA.times[DATA.tracks[s].at[k]]);
     Object.assign(track, { boxes: times.length, interpolated: 0, begin: times[0], seconds: times.at(-1) - times[0],
