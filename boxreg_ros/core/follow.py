@@ -261,7 +261,7 @@ def _placed(track_id: str, given: Sequence[_Seed], stamps_ns: Ints) -> _Object:
     seeds = Seeds(rows, np.array(list(boxes.values())).reshape(-1, 9))
     return _Object(
         track_id,
-        given[0].class_name,
+        Counter(seed.class_name for seed in given).most_common(1)[0][0],
         seeds,
         tuple(problems),
         is_pinned=any(seed.is_pinned for seed in given),

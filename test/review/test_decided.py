@@ -222,9 +222,12 @@ def corrected_by_file(followed, folder):
         Decision('1', stamps[2], 'pin', '', table.frame_id, pin),
         Decision('1', stamps[2], 'delete'),
         Decision('1', stamps[6], 'pin', '', table.frame_id, pin),
+        Decision('1', stamps[0], 'reclass', value='truck'),
     ]
     rows = run(folder / 'after', decisions)
     assert run.status == 0
+    classes = [row['class_name'] for (track_id, _), row in rows.items() if track_id == '1']
+    assert classes == ['truck'] + ['car'] * 11
     return rows, pin
 
 
@@ -642,7 +645,7 @@ def test_a_part_given_to_a_track_that_is_there_keeps_both_apart(tmp_path):
         assert is_there == [[True] * 5 + [False] * 11, [False] * 5 + [True] * 11], name
 
 
-def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path):
+def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path, capsys):
     _, stamps, _, out = completed
     decisions = [
         Decision('1', None, 'rename', value='2'),
@@ -651,6 +654,7 @@ def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path):
     run = Run(out.with_name('drive'))
     run(tmp_path / 'out', decisions)
     assert run.status == 0
+    assert "of two boxes of '2' at one stamp one is decided about" in capsys.readouterr().err
     classes = [one for one in read_decisions(tmp_path / 'out' / APPLIED) if one.kind == 'reclass']
     spans = [(one.stamp_ns, one.end_ns) for one in classes]
     assert all(any(a <= stamps[k] <= b for a, b in spans) for k in (2, 3, 4))
