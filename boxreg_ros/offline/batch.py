@@ -32,7 +32,9 @@ from boxreg_ros.offline.fleet import relabelled_drives
 from boxreg_ros.offline.job import Job, jobs_of, LEARNING
 from boxreg_ros.offline.relabel_command import Demands
 from boxreg_ros.offline.request import Request
-from boxreg_ros.offline.result_folder import earlier_summary, INPUT_MODEL, writing
+from boxreg_ros.offline.result_folder import earlier_summary, has_changed, INPUT_MODEL, writing
+from boxreg_ros.review.decisions import DECISIONS
+from boxreg_ros.review.folders import newest_of
 
 DRIVE = '{drive}'
 """Stands for the name of the drive in the options of a batch."""
@@ -82,6 +84,11 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError(
                 'RECORDING: expected at least one drive, got none; see boxreg batch -h'
             )
+        if args.decisions and len(jobs) > 1 and DRIVE not in str(args.decisions):
+            raise ConfigError(
+                f'--decisions: expected {DRIVE} in the path, a file for each drive, got '
+                f'{str(args.decisions)!r}: the same ids are of other objects in other drives'
+            )
         out = args.out if url_of(args.out) else args.out.absolute()
         if args.learn:
             args.input_model = (*args.input_model, _learnt(jobs, out, args))
@@ -90,6 +97,9 @@ def run(args: argparse.Namespace) -> int:
     done = sum(result.is_done for result in results)
     skipped = sum(result.status == UP_TO_DATE for result in results)
     print(f'{args.out}: {done:,} of {len(jobs):,} drives done, {skipped:,} of them earlier')
+    for result in results if url_of(out) is None else ():
+        if result.status == UP_TO_DATE and has_changed(out / result.drive / DECISIONS):
+            print(f'boxreg: {result.drive}: {_unwritten(out / result.drive)}', file=sys.stderr)
     others = _other_results(out, {job.name for job in jobs})
     if others:
         print(
@@ -97,6 +107,14 @@ def run(args: argparse.Namespace) -> int:
             f'report.html, which are of the drives of this call: give all to have them there'
         )
     return 0 if done == len(jobs) else 1
+
+
+def _unwritten(out: Path) -> str:
+    """Return where the labels with the decisions that were made on a result are."""
+    newest = newest_of(out)
+    if newest != out:
+        return f'the labels with the decisions of its review are in {newest}'
+    return f'its labels do not have the decisions of its review: boxreg review {out}, Ctrl-S'
 
 
 def _other_results(out: Path, names: Collection[str]) -> int:

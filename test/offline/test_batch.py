@@ -95,6 +95,14 @@ def test_results_of_other_calls_are_said(tmp_path, capsys):
     assert list(index_of(out)) == ['b']
     assert main(['batch', a, b, *command]) == 0
     assert capsys.readouterr().out == f'{out}: 2 of 2 drives done, 2 of them earlier\n'
+    decisions = out / 'a' / 'decisions.csv'
+    decisions.write_text(f'{DECISIONS}1,,delete,{"," * 11}\n')
+    assert main(['batch', a, b, *command]) == 0
+    assert f'a: its labels do not have the decisions of its review: boxreg review {out / "a"}' in (
+        capsys.readouterr().err
+    )
+    assert main(['batch', a, b, *command, f'--decisions={decisions}']) == 2
+    assert '--decisions: expected {drive} in the path' in capsys.readouterr().err
 
 
 def test_results_that_miss_a_demand_are_kept_and_not_done(tmp_path, capsys):
