@@ -22,8 +22,12 @@ function judgementOf(track) {
   return covering('judgement', inputOf(s, k), stampOf(s, k)).filter(isOfTrack).at(-1);
 }
 
+// The judgement of a box, as in a run: its own, else that of a range, else of its track; of equal ones the last.
+const closenessOf = row => (row.stamp_ns ? (row.end_ns ? 1 : 2) : 0);
+const judgementAt = (s, k) => covering('judgement', inputOf(s, k), stampOf(s, k)).reduce((a, b) => (closenessOf(a) > closenessOf(b) ? a : b), /** @type {any} */ ({})).decision;
+
 // Whether a person has accepted or corrected a box.
-const isAccepted = (s, k) => ['accept', 'pin'].includes(covering('judgement', inputOf(s, k), stampOf(s, k)).at(-1)?.decision);
+const isAccepted = (s, k) => ['accept', 'pin'].includes(judgementAt(s, k));
 
 // The judgement of the box that is shown alone, or of its range.
 function judgementOfBox() {
@@ -62,7 +66,11 @@ async function judge(kind, isBox) {
     const rows = isBox ? [held] : heldOver('judgement', current().members()).filter(isOfTrack);
     return decide(rows.map(row => ({ ...takenBack(row), comment: row.comment })));
   }
-  return decideAbout(chosenScopes(isBox).map(scope => rowOf(scope, kind, { comment: heldOf(scope)?.comment ?? '' })));
+  const { id } = current(), boxes = isBox ? [] : current().members();
+  if (!await decideAbout(chosenScopes(isBox).map(scope => rowOf(scope, kind, { comment: heldOf(scope)?.comment ?? '' })))) return false;
+  const others = boxes.filter(box => (kind === 'accept' ? ['reject'] : kind === 'reject' ? ['accept', 'pin'] : []).includes(judgementAt(...box))).length;
+  if (others) say(`Track ${id}, but for boxes with a decision of their own: ${others} ${kind === 'accept' ? 'rejected' : 'accepted or pinned'}.`);
+  return true;
 }
 
 async function comment(isBox, text) {
