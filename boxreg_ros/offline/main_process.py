@@ -20,7 +20,7 @@ from boxreg_ros.core.registrar import BoxRegistrar, Submit
 from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.io.input_models import disagreements
 from boxreg_ros.io.session import hand_to_registrar
-from boxreg_ros.offline.notes import closing_line
+from boxreg_ros.offline.notes import closing_line, doubts_line
 from boxreg_ros.offline.output import Sink
 from boxreg_ros.offline.products import (
     checked,
@@ -102,7 +102,10 @@ class MainProcess:
         """Write everything beside the labels into `folder`, which becomes `out`."""
         summary = self._summary(registrar, sink)
         summary.fingerprint = fingerprint
-        warnings = summary.warning, self.request.unbound_text()
+        corrections = sink.corrections
+        applied = corrections.applied()
+        doubts = [*self.request.doubts_on_decisions(), *corrections.doubts()]
+        warnings = summary.warning, self.request.unbound_text(), doubts_line(doubts)
         summary.warning = '; '.join(filter(None, warnings))
         if self.sweeps is not None:
             self.sweeps.places = self.recording.findings.places
@@ -123,7 +126,6 @@ class MainProcess:
         self._write_input_model(folder, registrar, summary)
         if self.request.decisions is not None:
             copyfile(self.request.decisions, folder / DECISIONS)  # a review goes on from there
-        applied = sink.corrections.applied()
         if applied:
             DecisionLog(folder / APPLIED).append(applied)
         settings = yaml.safe_dump(asdict(self.request.config), sort_keys=False)

@@ -79,6 +79,14 @@ def unused_line(unused: Sequence[str]) -> str:
     )
 
 
+def doubts_line(doubts: Sequence[str]) -> str:
+    """Return why decisions may not be what a person wants, in one line; empty for no reason."""
+    if not doubts:
+        return ''
+    more = len(doubts) - MAX_NAMED
+    return f'decisions: {"; ".join(doubts[:MAX_NAMED])}' + (f'; and {more:,} more' * (more > 0))
+
+
 def notes(summary: Summary) -> Iterator[str]:
     """Yield warnings about the input and the results, one line each."""
     yield from _input_notes(summary)

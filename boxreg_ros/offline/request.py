@@ -14,9 +14,15 @@ from boxreg_ros.errors import ConfigError, require_packages
 from boxreg_ros.io.lidars import Lidars, SINGLE_LIDAR
 from boxreg_ros.io.storage.urls import entries_of, url_of
 from boxreg_ros.labels import check_options, files_of, labels_points, module_of, Options
-from boxreg_ros.offline.result_folder import has_changed
+from boxreg_ros.offline.result_folder import earlier_summary, has_changed
 from boxreg_ros.options import option
-from boxreg_ros.review.decisions import APPLIED, DECISIONS, read_decisions
+from boxreg_ros.review.decisions import (
+    APPLIED,
+    contradictions,
+    DECISIONS,
+    joined_files,
+    read_decisions,
+)
 from msg_adapters.convention import Convention, STANDARD
 
 NO_TOPIC = 'none'
@@ -286,6 +292,24 @@ class Request:
         path = self.labels[1]
         path = (path if path.is_dir() else path.parent) / APPLIED
         return path if path.is_file() else None
+
+    def doubts_on_decisions(self) -> list[str]:
+        """Return why decisions may not be what a person wants here, in words."""
+        if self.decisions is None:
+            return []
+        found = []
+        reviewed = (earlier_summary(self.decisions.parent) or {}).get('recordings', ())
+        others = [Path(path).name for path in reviewed]
+        own = [path.name for path in self.recordings]
+        if others and not {*others} & {*own}:
+            found.append(
+                f'they were made on {", ".join(others)}, whose ids may be of other objects than '
+                f'those of {", ".join(own)}'
+            )
+        differences = contradictions(joined_files(self.decisions))
+        return found + [
+            f'joined files differ about {each}: the last holds' for each in differences
+        ]
 
     def unbound_text(self, refines: bool = True) -> str:
         """

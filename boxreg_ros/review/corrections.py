@@ -8,8 +8,9 @@ from itertools import chain, groupby, pairwise
 from typing import NamedTuple, TYPE_CHECKING
 
 from boxreg_ros.errors import RecordingError
+from boxreg_ros.io.stamp_join import LARGEST_OFFSET_NS
 from boxreg_ros.reasons import Reason
-from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, Scope, TOPIC_OF, WITH_BOX
+from boxreg_ros.review.decisions import Decision, held, MAX_STAMP_NS, text_of, TOPIC_OF, WITH_BOX
 from boxreg_ros.structures import (
     BOX_EXTENT,
     BoxArray,
@@ -77,6 +78,10 @@ class Corrections:
             for one in held(decisions)
             if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
         }
+        self._ranges = _by_track(
+            one for one in held(decisions) if one.end_ns is not None and not one.is_taken_back
+        )
+        self._doubts: set[str] = set()  # see `doubts`
         self._extents = self._extents_of_pins()
         self._input_ids: dict[tuple[str, int], str] = {}  # by new id and stamp, where renamed
         self._own_ids: set[str] = set()  # of input boxes that are not renamed
@@ -88,7 +93,11 @@ class Corrections:
 
     def unused(self) -> list[str]:
         """Return the tracks and boxes with a decision that the recording does not have."""
-        return [_text_of(scope) for scope in sorted(self._unused, key=str)]
+        return [text_of(scope) for scope in sorted(self._unused, key=str)]
+
+    def doubts(self) -> list[str]:
+        """Return the boxes that decisions may be about, or may not, in words."""
+        return sorted(self._doubts)
 
     def seeds(self, frame_id: str) -> list[BoxArray]:
         """
@@ -287,6 +296,7 @@ class Corrections:
         given = given.plain()  # `with_attributes` gives the result its own
         for row, is_pinned in enumerate(given.is_pinned.tolist()):
             track_id = given.track_ids[row]
+            self._note_near(track_id, given.stamp_ns)
             if is_pinned or 'class' in self._stated_earlier(track_id, given.stamp_ns):
                 self._human_classes[track_id, given.stamp_ns] = given.class_names[row]
         if not self._of_track:
@@ -317,6 +327,15 @@ class Corrections:
             boxes[i] = found.box
             pinned[i] = True
         return replace(renamed, boxes=boxes, pinned=pinned)
+
+    def _note_near(self, track_id: str, stamp_ns: int) -> None:
+        """Note the ranges that end beside a box: their stamps may have been rounded."""
+        for one in self._ranges.get(track_id, ()):
+            away_ns = min(abs(end_ns - stamp_ns) for end_ns in _span_of(one))
+            if away_ns <= LARGEST_OFFSET_NS and not one.covers(stamp_ns):
+                self._doubts.add(
+                    f'{one.kind} of {text_of(one.scope)} leaves out the box {away_ns} ns beside it'
+                )
 
     def apply(self, given: BoxArray, refined: RefinedBoxes) -> RefinedBoxes:
         """
@@ -420,7 +439,12 @@ class Corrections:
         found: list[Decision] = []
         apart = self.apart
         for track_id, rows in self._of_result.items():
-            rows.sort()
+            rows.sort(key=lambda one: one[:3])
+            if any(a.stamp_ns == b.stamp_ns and a[3:] != b[3:] for a, b in pairwise(rows)):
+                self._doubts.add(
+                    f'of two boxes of {track_id!r} at one stamp one is decided about, which later '
+                    f'runs cannot tell from the other'
+                )
             if track_id in apart:  # also boxes that a step has added
                 rows = [one._replace(track_id=track_id) for one in rows]
             for topic in dict.fromkeys(topic for one in rows for topic in one.stated):
@@ -677,10 +701,3 @@ def _closeness(decision: Decision) -> int:
     if decision.stamp_ns is None:
         return 0
     return 2 if decision.end_ns is None else 1
-
-
-def _text_of(scope: Scope) -> str:
-    track_id, stamp_ns, end_ns = scope
-    if stamp_ns is None:
-        return f'{track_id!r}'
-    return f'{track_id!r} at {stamp_ns}' + (f' to {end_ns}' if end_ns is not None else '')

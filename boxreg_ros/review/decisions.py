@@ -15,6 +15,7 @@ import csv
 from dataclasses import dataclass, replace
 import fcntl
 import io
+from itertools import chain
 from math import dist
 import os
 from pathlib import Path
@@ -209,11 +210,39 @@ def held(decisions: Iterable[Decision]) -> list[Decision]:
 
 
 def read_decisions(path: Path) -> list[Decision]:
+    """Return the decisions of a file, or of several that are joined, see `joined_files`."""
+    return [*chain.from_iterable(joined_files(path))]
+
+
+def contradictions(files: Iterable[Sequence[Decision]]) -> list[str]:
+    """Return the tracks and boxes about which joined files differ, with both decisions."""
+    before: dict[tuple[str, Scope], Decision] = {}
+    found = []
+    for own in files:
+        last = {(one.topic, one.scope): one for one in held(own)}
+        for key in last.keys() & before.keys():
+            words = [f'{one.kind} {one.value}'.strip() for one in (before[key], last[key])]
+            if words[0] != words[1]:
+                found.append(f'{text_of(key[1])} ({words[0]}, then {words[1]})')
+        before |= last
+    return sorted(found)
+
+
+def text_of(scope: Scope) -> str:
+    """Return the boxes of a decision in words."""
+    track_id, stamp_ns, end_ns = scope
+    if stamp_ns is None:
+        return f'{track_id!r}'
+    return f'{track_id!r} at {stamp_ns}' + (f' to {end_ns}' if end_ns is not None else '')
+
+
+def joined_files(path: Path) -> list[list[Decision]]:
     """
     Return the decisions of a file, in its order; a last row that is cut is left out.
 
-    Files of several people may be joined by ``cat``: their first lines are left out, and what two
-    files add under one id are two objects, unless both have a box of it at the same place.
+    Files of several people may be joined by ``cat``, and are returned as such: their first lines
+    are left out, as are rows of an earlier one, from which both have gone on; and what two files
+    add under one id are two objects, unless both have a box of it at the same place.
 
     Raises RecordingError if the file cannot be read, is of a later version, lacks a column, or a
     row is no decision.
@@ -229,7 +258,7 @@ def read_decisions(path: Path) -> list[Decision]:
         ) from None
     whole = _whole_rows(text)
     if not whole:
-        return []
+        return [[]]
     version = _version_of(whole)
     if version not in (1, VERSION):
         raise RecordingError(
@@ -246,9 +275,7 @@ def read_decisions(path: Path) -> list[Decision]:
             f'{path}: expected decisions of boxreg review, got a file without the columns '
             f'{", ".join(missing)}; give {DECISIONS} of a reviewed result'
         )
-    decisions: list[Decision] = []
-    first = 0  # of the file that a row is of
-    number = 1
+    files: list[list[Decision]] = [[]]
     for row in reader:
         line = reader.line_num + lines_before
         try:
@@ -256,10 +283,9 @@ def read_decisions(path: Path) -> list[Decision]:
             if is_version and _version_of(row['track_id']) != version:
                 raise RecordingError(f'expected a file of version {version}, as the first one')
             if row['decision'] == 'decision':  # another file begins
-                decisions[first:] = _apart(decisions[:first], decisions[first:], number)
-                first, number = len(decisions), number + 1
+                files.append([])
             elif not is_version:
-                decisions.append(_parsed(row, version))
+                files[-1].append(_parsed(row, version))
         except RecordingError as error:
             raise RecordingError(f'{path}: line {line}: {error}') from None
         except (ValueError, TypeError, AttributeError) as error:
@@ -267,7 +293,12 @@ def read_decisions(path: Path) -> list[Decision]:
                 f'{path}: line {line}: expected numbers, got: {error}; correct the line, or '
                 f'remove it'
             ) from None
-    return decisions[:first] + _apart(decisions[:first], decisions[first:], number)
+    for number in range(1, len(files)):
+        before = [*chain.from_iterable(files[:number])]
+        known = {tuple(one.row()) for one in before if one.when}
+        own = _apart(before, files[number], number + 1)
+        files[number] = [one for one in own if tuple(one.row()) not in known]
+    return files
 
 
 def _apart(before: Sequence[Decision], own: Sequence[Decision], number: int) -> list[Decision]:

@@ -21,7 +21,14 @@ from boxreg_ros.io.box_table import BoxTable
 from boxreg_ros.labels import LabelFrame, Options, Provenance
 from boxreg_ros.labels.csv import Writer as csv_writer
 from boxreg_ros.review.corrections import Corrections
-from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
+from boxreg_ros.review.decisions import (
+    contradictions,
+    Decision,
+    DecisionLog,
+    DECISIONS,
+    joined_files,
+    read_decisions,
+)
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept, RefinedBoxes
 from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
@@ -179,6 +186,19 @@ def test_decisions_of_two_people_are_joined_by_cat(tmp_path):
     both = tmp_path / 'both'
     both.write_bytes(b''.join(parts))
     assert read_decisions(both) == [*first, *second]
+    common = Decision('1', None, 'reject', who='c', when='2026-01-01')
+    rows = {
+        'b': [common, Decision('2', None, 'accept', who='b'), Decision('1', None, 'accept')],
+        'a': [common, Decision('2', None, 'unsure', who='a')],
+    }
+    for name, own in rows.items():
+        DecisionLog(tmp_path / f'copy_{name}').append(own)
+    copies = [(tmp_path / f'copy_{name}').read_bytes() for name in rows]
+    (tmp_path / 'copies').write_bytes(b''.join(copies))
+    files = joined_files(tmp_path / 'copies')
+    # What both copies have begun with is no later word of the second.
+    assert files == [rows['b'], rows['a'][1:]]
+    assert contradictions(files) == ["'2' (accept, then unsure)"]
     other = tmp_path / 'other'
     other.write_bytes(parts[0] + b'# boxreg decisions 9\n')
     with pytest.raises(RecordingError, match='line 4: expected a file of version 2'):
@@ -301,6 +321,7 @@ def test_deleted_renamed_and_reclassed_boxes_of_a_range():
     assert found.reasons == ('deleted', '', '', '', '')
     assert found.num_points.tolist() == [0, 0, 1, 2, 3]
     assert corrections.unused() == ["'4' at 6 to 9"]
+    assert corrections.doubts() == ["delete of '4' at 6 to 9 leaves out the box 1 ns beside it"]
 
 
 def test_a_pin_holds_its_extents_along_the_whole_track():
@@ -807,11 +828,17 @@ def test_a_box_is_decided_about_and_commented_on_beside_its_track(server):
         selected = page.locator('#rows tr[aria-selected=true] .decision')
         assert selected.inner_text() == 'accept, 1 box'
         stamp = int(page.evaluate('view.part.stamps[view.row]'))
+        press(page, 'Shift+R', "judgementOfBox().decision === 'reject'")
+        press(page, 'u', "judgementOf(current()).decision === 'unsure'")
+        press(page, 'a', "$('notice').textContent.includes('of their own: 1 rejected')")
     made = read_decisions(server.log_paths[0])
     assert [(one.stamp_ns, one.kind, one.comment) for one in made] == [
         (None, 'accept', ''),
         (stamp, 'unsure', ''),
         (stamp, 'unsure', 'hidden'),
+        (stamp, 'reject', 'hidden'),
+        (None, 'unsure', ''),
+        (None, 'accept', ''),
     ]
 
 

@@ -258,4 +258,7 @@ def test_a_result_with_decisions_is_not_replaced_by_one_without(tmp_path, capsys
     assert main([*command, str(out)]) == 2
     assert 'those of a person would be lost' in capsys.readouterr().err
     assert (out / 'boxes.csv').read_bytes() == before
+    other = Drive(sweeps=8).write(tmp_path / 'other')
+    assert main(['relabel', str(other), *QUICK, '-o', str(tmp_path / 'x'), *decisions]) == 0
+    assert 'decisions: they were made on drive.mcap, whose ids' in capsys.readouterr().err
     assert main([*command, str(out), *decisions, '--set=lag=2']) == 0
