@@ -36,6 +36,9 @@ Centre and extents have six degrees of freedom: chi-square has 99.7 % below 20.
 """
 MIN_JUMPS = 5
 """Jumps of ids from object to object that a finding needs; chosen."""
+JUMPS_OF_AN_ID = 2
+"""Jumps of each id that jumps at all, in the mean, that a finding needs. Derived: where a tracker
+begins its ids anew, each jumps once."""
 MIN_JUMP_SHARE = 0.02
 """
 Share of the boxes at which ids jump.
@@ -346,6 +349,7 @@ class IdCheck:
     def __init__(self, max_gap: float) -> None:
         self.tracker = Tracker(max_gap)
         self.jumps = 0
+        self._jumped = set[str]()  # ids
         self.boxes = 0
         self.new = 0
         self.compared = 0
@@ -404,8 +408,10 @@ class IdCheck:
             own = column_of.get(self._track_of.get(boxes.track_ids[row], ''))
             if own is None:
                 continue
-            if costs.values[at, own] >= GATE and costs.is_apart[at, own]:
-                count += associated[row] in column_of
+            is_far = costs.values[at, own] >= GATE and costs.is_apart[at, own]
+            if is_far and associated[row] in column_of:
+                count += 1
+                self._jumped.add(boxes.track_ids[row])
         return count
 
     @property
@@ -423,7 +429,8 @@ class IdCheck:
                 f'{self.twice} of {self.count} boxes have the track id of another box of their '
                 f'message, as of trackers for one class each: expected one id for each object'
             )
-        if self.jumps < MIN_JUMPS or self.jumps < MIN_JUMP_SHARE * self.boxes:
+        least = max(MIN_JUMPS, MIN_JUMP_SHARE * self.boxes, JUMPS_OF_AN_ID * len(self._jumped))
+        if self.jumps < least:
             return ''
         return (
             f'track ids jump from object to object, at {self.jumps} of {self.boxes} boxes: '

@@ -127,6 +127,15 @@ def test_a_switch_of_a_tracker_is_no_finding():
     assert not check.finding
 
 
+def test_a_tracker_that_begins_its_ids_again_is_no_finding():
+    def arrays():
+        for k, (stamp, ids, boxes) in enumerate(street()):
+            yield array(stamp, ids[::-1] if k >= 15 else ids, boxes)
+
+    check = id_finding(arrays())
+    assert (check.jumps, check.finding) == (8, '')
+
+
 def test_ids_that_are_new_or_missing_are_found_and_others_are_not():
     def arrays(names):
         for k, (stamp, ids, boxes) in enumerate(street()):
