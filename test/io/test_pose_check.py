@@ -466,6 +466,21 @@ def test_boxes_without_heights_are_named():
         assert (f'all of 100 boxes have z of {z}:' in check.flat) == is_named
 
 
+def test_boxes_along_the_axes_of_their_frame_are_named():
+    boxes = np.tile([5.0, 0, 0, 4, 2, 1.5, 0, 0, 0], (100, 1))
+    T_map_lidar = np.eye(4)
+    T_map_lidar[:3, :3] = Rotation.from_euler('z', 0.4).as_matrix()
+    cases = (0, 0, True), (0, np.pi / 2, True), (0, 0.01, False), (1, 1, False)
+    for yaw, last, is_named in cases:
+        boxes[:, 8] = yaw
+        boxes[-1, 8] = last
+        check = PlaceCheck(STANDARD)
+        check.add(Sweep(STAMP, 'map', np.zeros((3, 3))), T_map_lidar)
+        array = replace(array_of(*boxes), frame_id='lidar')
+        check.add(boxes_to_frame(array, T_map_lidar, 'map'), T_map_lidar)
+        assert ('all of 100 boxes are along the axes' in check.unturned) == is_named
+
+
 def test_boxes_of_another_frame_than_their_messages_name_are_named():
     text = placed(frame='map')
     assert 'set boxes_frame:=map (boxreg relabel: --boxes-frame map)' in text

@@ -132,7 +132,8 @@ class InputChecks:
         of_ways = (self._axis.class_finding or self._axis.finding) if ids_identify else ''
         of_classes = '' if self._axis.is_turned else self._pose.class_finding
         of_axes = of_classes or of_ways or self._pose.finding
-        poses = self._unit.finding or self._place.finding or of_axes or self._place.flat
+        found = self._unit.finding or self._place.finding or of_axes
+        poses = found or self._place.flat or self._place.unturned
         known = self._motion.findings.copy()
         of_stamps = [one.finding for one in self._stamps.values() if one.finding]
         if of_stamps:

@@ -46,7 +46,8 @@ Chosen: on the sample the right place has 4 times that of the second.
 
 """
 MAX_FLAT = 1e-5
-"""Difference of heights that count as one [m]; derived: rounding of float32 and transforms."""
+"""Difference of heights [m] or angles [rad] that count as one; derived: rounding of float32 and
+transforms."""
 MIN_UPRIGHT = 0.5
 """Cosine of the tilt below which a box is not upright; derived: 60 degrees."""
 MIN_TILTED = 0.3
@@ -102,6 +103,7 @@ class PlaceCheck(PairedCheck):
         # As read, and with w at the other end of the quaternion: cosine of the tilt.
         self._tilts: list[tuple[float, float]] = []
         self._heights: list[float] = []  # in the frame of the messages
+        self._yaws: list[float] = []  # in the same, less quarter turns
         self._stands: list[float] = []  # cosine of z of each box with that of the fixed frame
         self._fixed_frame = ''
         self._frames: dict[str, Floats] = {}
@@ -155,6 +157,7 @@ class PlaceCheck(PairedCheck):
         self._stands += uprightness(own).tolist()
         _add_coverages(self._own, points, own)
         self._heights += raw.boxes[:, BOX_CENTER][:, 2].tolist()
+        self._yaws += np.remainder(raw.boxes[:, YAW] + np.pi / 4, np.pi / 2).tolist()
         for place in self._others.values():
             if place.convention is not None:
                 meant = place.convention.to_centers(raw).boxes
@@ -217,6 +220,21 @@ class PlaceCheck(PairedCheck):
             f'only where {z:g} is the height of their centres: if the ground is there, '
             f'{advice("pose_reference", "bottom")}; a pose at another height is a fraction of '
             f'that of the box, as in --pose-reference=0,0,0.5'
+        )
+
+    @property
+    def unturned(self) -> str:
+        """Return that all boxes are along the axes of their frame, as simple clusters; else ''."""
+        if len(self._yaws) < MAX_COMPARED:
+            return ''
+        if np.abs(np.array(self._yaws) - np.pi / 4).max() > MAX_FLAT:
+            return ''
+        return (
+            f'all of {len(self._yaws)} boxes are along the axes of the frame of their messages: '
+            f'expected the directions of their objects, got those of a detector without yaw: '
+            f'extents and yaw are right only where an object stands along these axes; give boxes '
+            f'the direction in which their tracks move, or the rectangles with least area around '
+            f'their points'
         )
 
     def _place_text(self) -> str:
