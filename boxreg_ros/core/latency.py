@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from math import inf
 from typing import Any, NamedTuple
 
@@ -65,6 +65,8 @@ STEADY_SPREAD = 0.005
 """Stamps of boxes are steadily off their sweeps where four of five are within so much [s]."""
 MAX_SAMPLES = 600
 """Comparisons that are kept: the newest, so that the estimate follows a latency that changes."""
+MIN_OF_LIDAR = 3
+"""Moving objects that show the latency of a LiDAR of several; measured: one was off by 0.26 s."""
 TRACK_SECONDS = 3.0
 """Boxes of a track are held this long [s]."""
 SWEEPS_HELD = 16
@@ -98,10 +100,18 @@ class Latency(NamedTuple):
     """Whether it is not one time: older evidence was forgotten."""
     is_beyond: bool = False
     """Whether it is as large as what is compared, or larger: nothing is corrected."""
+    lidars: str = ''
+    """Which LiDARs show another one than others: nothing is corrected; empty if all agree."""
 
     @property
     def warning(self) -> str:
         """Return what a user should know; empty for boxes that are in time, or may be."""
+        if self.lidars:
+            return (
+                f'clocks: expected one for all LiDARs, got stamps of {self.lidars}, by boxes that '
+                f'move: synchronise their clocks (PTP), and let all drivers stamp the same moment '
+                f'of a sweep'
+            )
         if self.estimated is None:
             return ''
         word = 'late' if self.estimated > 0 else 'early'
@@ -147,6 +157,8 @@ class _Sample(NamedTuple):
     track_id: str
     speed: float
     costs: Floats
+    sensor: int = 0
+    """The LiDAR of most of the points."""
 
 
 class _Comparisons(NamedTuple):
@@ -244,11 +256,14 @@ class LatencyEvidence:
                 for _ in range(half):
                     self._samples.popleft()
             found = _estimated(known)
+            lidars = _lidars_apart(self._samples)
             # Where nothing was or is corrected, a few objects erred for a while.
             drifts |= is_new and bool(self._latency.seconds or found.seconds)
             found = _as_stamped(found, self._steady_offsets())._replace(drifts=drifts)
             if abs(found.seconds - self._latency.seconds) < STEP:
                 found = found._replace(seconds=self._latency.seconds)
+            if lidars:
+                found = found._replace(seconds=0.0, lidars=lidars)
             self._latency = found
         return self._latency
 
@@ -292,12 +307,14 @@ class LatencyEvidence:
             smoothed = tracks.smoothed(some, times_ns)
             paths = [_Path(*path) for path in zip(some, *smoothed, strict=True)]
             paths = [path for path in paths if path.speed > MIN_SPEED]
-            for path, points in zip(paths, _points_near(sweep, paths), strict=True):
-                costs = _costs(path, *points)
+            for path, near in zip(paths, _points_near(sweep, paths), strict=True):
+                costs = _costs(path, near.points, near.times)
                 if costs is None or found == OBJECTS_COMPARED:
                     continue
                 self._has_new_samples = True
-                self._samples.append(_Sample(sweep.stamp_ns, path.track_id, path.speed, costs))
+                self._samples.append(
+                    _Sample(sweep.stamp_ns, path.track_id, path.speed, costs, near.sensor)
+                )
                 found += 1
             if found == OBJECTS_COMPARED:
                 break
@@ -430,8 +447,16 @@ def _costs(path: _Path, points: Floats, times: Floats) -> Floats | None:
     return costs if is_known else None
 
 
-def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Floats]]:
-    """Return points (3, M) around the boxes of each path, above the road, and their times (M,)."""
+class _Near(NamedTuple):
+    """Points (3, M) around the boxes of a path, above the road, their times (M,), and LiDAR."""
+
+    points: Floats
+    times: Floats
+    sensor: int
+
+
+def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[_Near]:
+    """Return the points around each path."""
     if not paths:
         return []
     around = _boxes_around(np.array([path.boxes for path in paths]))
@@ -446,7 +471,10 @@ def _points_near(sweep: Sweep, paths: Sequence[_Path]) -> list[tuple[Floats, Flo
         times = np.zeros(len(rows))
         if sweep.times is not None:
             times[:] = sweep.times[rows]
-        found.append((points, times))
+        sensor = 0
+        if sweep.sensors is not None and len(rows):
+            sensor = int(np.bincount(sweep.sensors[rows]).argmax())
+        found.append(_Near(points, times, sensor))
     return found
 
 
@@ -477,6 +505,26 @@ def _differ(older: _Comparisons, newer: _Comparisons) -> bool:
     assert before.deviation is not None and after.deviation is not None
     drift = abs(after.estimated - before.estimated)
     return drift >= NOTABLE + SIGNIFICANCE * float(np.hypot(before.deviation, after.deviation))
+
+
+def _lidars_apart(samples: Collection[_Sample]) -> str:
+    """Return which LiDAR shows another latency than one before it, and by how much; or ''."""
+    of_sensor: dict[int, list[_Sample]] = {}
+    for sample in samples:
+        of_sensor.setdefault(sample.sensor, []).append(sample)
+    known = {sensor: _Comparisons.of(some) for sensor, some in sorted(of_sensor.items())}
+    for one, other in combinations(known, 2):
+        before, after = _estimated(known[one]), _estimated(known[other])
+        is_known = min(before.tracks, after.tracks) >= MIN_OF_LIDAR
+        is_late = before.seconds or after.seconds  # by itself, it would be corrected
+        if is_known and is_late and _differ(known[one], known[other]):
+            assert before.estimated is not None and after.estimated is not None
+            apart = after.estimated - before.estimated
+            return (
+                f'LiDAR {other + 1} (in the order of points) that are {abs(apart):.2f} s '
+                f'{"behind" if apart > 0 else "ahead of"} those of LiDAR {one + 1}'
+            )
+    return ''
 
 
 def _estimated(known: _Comparisons) -> Latency:

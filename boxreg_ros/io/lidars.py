@@ -409,6 +409,7 @@ class SweepMerger:
         self._span_ns = round(span * 1e9)
         self._report = report
         self.counts = {topic: Counter[str]() for topic in topics}
+        self._left_out = set[str]()
         self.forget()
 
     def forget(self) -> None:
@@ -416,7 +417,8 @@ class SweepMerger:
         self._groups: list[_Period] = []  # ascending by stamp
         self._heard_ns: dict[str, int] = {}
         self._offsets_ns: dict[str, int] = {}  # of the LiDARs in the last sweep, if complete
-        self._returned_ns: int | None = None
+        self._returned_ns: dict[str, int] = {}  # of the clouds in the last sweep, by topic
+        self._last_ns = 0  # stamp of the last sweep
 
     def add(self, sweep: Sweep, extra: Any = None) -> list[MergedSweep]:
         """
@@ -444,7 +446,7 @@ class SweepMerger:
                 f'a cloud of {sweep.stamp_ns} ns arrived after the others of its time were merged',
             )
             heard_ns = self._heard_ns[sweep.topic]
-            if sweep.stamp_ns >= (self._returned_ns or 0) - self._span_ns:
+            if sweep.stamp_ns >= max(self._returned_ns.values(), default=0) - self._span_ns:
                 self._heard_ns[sweep.topic] = max(heard_ns, sweep.stamp_ns)  # awaited from now on
             return []
         group[sweep.topic] = sweep, extra
@@ -452,6 +454,16 @@ class SweepMerger:
             self._heard_ns = dict.fromkeys(self._topics, sweep.stamp_ns)
         self._heard_ns[sweep.topic] = sweep.stamp_ns
         return self._pop_complete()
+
+    def leave_out(self, sweep: Sweep) -> list[MergedSweep]:
+        """Count a cloud of another clock; the first of its LiDAR returns the sweeps without it."""
+        self._note(sweep.topic, CLOUD_LATE, f'a cloud of {sweep.stamp_ns} ns is of another clock')
+        if sweep.topic in self._left_out:
+            return []
+        self._left_out.add(sweep.topic)
+        others = [self._merged(group) for group in self._groups if sweep.topic not in group]
+        self.forget()  # its stamps, beside which those of the others are late
+        return others
 
     def flush(self) -> list[MergedSweep]:
         """Return all sweeps that are held, complete or not."""
@@ -462,11 +474,23 @@ class SweepMerger:
         for group in self._groups:
             if self._takes(group, sweep):
                 return group
-        newest_ns = _first_ns(self._groups[-1]) if self._groups else self._returned_ns
-        if newest_ns is not None and sweep.stamp_ns <= newest_ns:
+        if self._is_late(sweep):
             return None
-        self._groups.append({})
-        return self._groups[-1]
+        place = sum(_first_ns(group) < sweep.stamp_ns for group in self._groups)
+        self._groups.insert(place, {})
+        return self._groups[place]
+
+    def _is_late(self, sweep: Sweep) -> bool:
+        """Return whether sweeps of its time were returned, or all that wait are far later."""
+        if self._groups and sweep.stamp_ns < _first_ns(self._groups[0]) - self._span_ns:
+            return True
+        returned_ns = self._returned_ns
+        if not returned_ns:
+            return False
+        own_ns = returned_ns.get(sweep.topic)
+        if own_ns is None:
+            return sweep.stamp_ns <= max(returned_ns.values())
+        return sweep.stamp_ns <= max(own_ns, self._last_ns)
 
     def _takes(self, group: _Period, sweep: Sweep) -> bool:
         """
@@ -510,11 +534,12 @@ class SweepMerger:
                 self.counts[topic][CLOUD_MERGED] += 1
             else:
                 self._note(topic, CLOUD_MISSING, f'no cloud at {first_ns} ns')
-        self._returned_ns = max(sweep.stamp_ns for sweep, _ in group.values())
+        self._returned_ns = {topic: sweep.stamp_ns for topic, (sweep, _) in group.items()}
         self._offsets_ns = {}
         if not self._awaited(group):
             self._offsets_ns = {t: sweep.stamp_ns - first_ns for t, (sweep, _) in group.items()}
         clouds = [group[topic] for topic in self._topics if topic in group]
+        self._last_ns = clouds[0][0].stamp_ns
         there = [cloud for cloud in clouds if not cloud[0].is_dropped]
         if not there:
             return MergedSweep(clouds[0][0], ())

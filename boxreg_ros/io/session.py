@@ -175,6 +175,8 @@ class Session:
         """
         if self._merger is None:
             return [MergedSweep(sweep, (extra,))]
+        if sweep.topic in self._checks.other_clocks:
+            return self._merger.leave_out(sweep)
         return self._merger.add(sweep, extra)
 
     @property

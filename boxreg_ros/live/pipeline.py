@@ -345,7 +345,8 @@ class MessagePipeline:
         latency = self._latency = self.registrar.latency
         ticket_of(pair.boxes).is_late = latency.seconds != 0
         if latency.warning:
-            self._report(Reason.LATENCY, latency.warning, 1)
+            reason = Reason.CLOCK_OFFSET if latency.lidars else Reason.LATENCY
+            self._report(reason, latency.warning, 1)
         if self.registrar.visible_boxes.warning:
             self._report(Reason.VISIBLE_BOXES, self.registrar.visible_boxes.warning, 1)
         return pair.boxes

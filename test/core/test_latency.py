@@ -88,6 +88,27 @@ def test_more_than_is_compared_is_not_corrected_but_said(sample_drive, seconds, 
     assert f'boxes are {words} or more, which is not corrected' in found.warning
 
 
+@pytest.mark.parametrize('behind, text', [(0, ''), (2, 'behind'), (-2, 'ahead of')])
+def test_lidars_that_show_another_latency_each_have_another_clock(sample_drive, behind, text):
+    given, sweeps = sample_drive.sweeps[2:-2], []
+    for sweep, other in zip(given, sample_drive.sweeps[2 - behind :], strict=False):
+        points = sweep.in_frame().points.copy()
+        sensors = (points[:, 1] < sweep.origin[1]).astype(np.uint8)
+        points[sensors == 1] += (other.origin - sweep.origin).astype(np.float32)
+        times = sweep.times - 0.1 * behind * sensors
+        origins = np.array([sweep.origin, other.origin])
+        sweeps.append(
+            replace(
+                sweep, points=points, times=times, sensors=sensors, origins=origins,
+                T_frame_points=None,
+            )
+        )  # fmt: skip
+    found = estimated(sweeps, sample_drive.boxes)
+    assert found.seconds == 0
+    assert ('got stamps of LiDAR 2 (in the order' in found.warning) == bool(text)
+    assert f's {text} those of LiDAR 1' in found.warning or not text
+
+
 def test_of_many_objects_every_one_is_evidence(sample_drive, monkeypatch):
     # Of a sweep 16 are compared at most: they take turns.
     compared, sample = Counter(), latency._Sample

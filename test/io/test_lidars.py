@@ -60,6 +60,23 @@ def test_a_cloud_may_arrive_after_one_of_the_next_period():
     assert groups(order) == [[[0, 30, 60], [100, 130, 160]], []]
 
 
+def test_clouds_of_one_lidar_may_arrive_in_another_order():
+    order = [('b', 1000), ('a', 1000)]
+    for k in range(1, 9, 2):
+        order += [('a', 1100 + 100 * k), ('b', 1000 + 100 * k), ('a', 1000 + 100 * k)]
+        order += [('b', 1100 + 100 * k)]
+    complete, rest = groups(order, topics=('a', 'b'))
+    assert complete + rest == [[1000 + 100 * k] for k in range(9)]
+
+
+def test_a_lidar_that_stamps_the_end_of_a_sweep_loses_no_cloud_of_the_others():
+    order = [
+        (name, 1000 + 99 * k + offset) for k in range(9) for name, offset in (('a', 0), ('b', 100))
+    ]
+    complete, rest = groups(order, topics=('a', 'b'))
+    assert complete + rest == [[1000 + 99 * k, 1100 + 99 * k] for k in range(9)]
+
+
 def test_a_silent_lidar_is_waited_for_one_second_only():
     reports = []
     offsets = {'a': 0, 'b': 10, 'c': 20}

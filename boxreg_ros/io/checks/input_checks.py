@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from functools import partial
 
 from boxreg_ros.config import Config
@@ -46,6 +47,11 @@ class InputChecks:
         self._twice = TwiceCheck(config)
         self._stamps: dict[str, StampCheck] = {}  # by topic of clouds
         self.restart()
+
+    @property
+    def other_clocks(self) -> Set[str]:
+        """Return the topics of LiDARs whose clock differs from those of others and the motion."""
+        return self._motion.other_clocks
 
     def restart(self) -> None:
         """Forget what a time jump parts."""

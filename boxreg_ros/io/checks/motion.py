@@ -8,7 +8,7 @@ The same for the live node and for recordings.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from math import inf
 
 from boxreg_ros.io.checks.finding import Finding
@@ -90,6 +90,7 @@ class MotionCheck:
         self.findings: dict[str, Finding] = {}
         self._clouds_ns = inf, -inf  # first and last stamp
         self._displaced: dict[tuple[str, str, str], FrameSteps] = {}  # that jump between clouds
+        self.other_clocks: Set[str] = frozenset()
         self.forget()
 
     def forget(self) -> None:
@@ -254,9 +255,10 @@ class MotionCheck:
         edge = max(moving, key=Edge.way, default=None)
         offsets = {} if edge is None else self._offsets_from(edge.arrivals)
         off = {topic: one for topic, one in offsets.items() if abs(one) >= MIN_CLOCK_OFFSET}
+        self.other_clocks = off.keys() if len(off) < len(offsets) else frozenset()
         if edge is None or not off:
             return ''
-        if len(off) < len(offsets):
+        if self.other_clocks:
             return _lidars_text(off)
         measured = min(off.values(), key=abs)
         offset, names = likely_offset(measured)
