@@ -89,7 +89,8 @@ def test_undo_and_redo_outlast_a_reload_and_leave_what_others_decided(out, serve
         page.keyboard.press('ArrowUp')
         press(page, 'Enter', 'pinOf(3)')
         reload()
-        press(page, 'z', 'log.held.size === 1')
+        press(page, 'z', "$('notice').textContent.startsWith('Undone: pin')")
+        assert page.evaluate('log.held.size') == 1
         reload()
         press(page, 'z', 'log.held.size === 0')
         press(page, 'y', f"{judged} === 'accept'")
@@ -388,6 +389,10 @@ def test_classes_have_keys_and_tracks_below_a_risk_are_accepted_at_once(out):
     with serving(server), opened_page(server.address + '#track=2') as page:
         press(page, '2', "current().class === 'cargo bike'")
         page.keyboard.press('9')  # there is none
+        page.keyboard.press('k')
+        page.wait_for_selector('#ask[open]')
+        page.fill('#ask-text', 'vna')
+        press(page, 'Enter', "$('failure').textContent.startsWith('No class vna in the list')")
         page.keyboard.press('k')
         shown = page.locator('#ask-proposals button').all_inner_texts()
         assert shown == ['1 van', '2 cargo bike']

@@ -176,6 +176,7 @@ async function reclass() {
 
 async function classify(name) {
   if (!name || isCorrecting() || (name === current().class && view.mark === null)) return;
+  if (view.classes.length && !view.classes.includes(name)) return fail(`No class ${name} in the list: choose one of ${view.classes.join(', ')}.`);
   return decideAbout(chosenScopes(view.mark !== null).map(scope => rowOf(scope, 'reclass', { value: name })));
 }
 

@@ -116,17 +116,20 @@ async function decide(rows) {
 }
 
 // One step back or forth, after the one that is under way.
-const undo = () => takeStep(() => log.made.at(-1), 'before', 'after', 'Nothing of yours to undo.');
-const redo = () => takeStep(() => log.undone.at(-1), 'after', 'before', 'Nothing of yours to do again.');
+const undo = () => takeStep(() => log.made.at(-1), 'before', 'after', 'Nothing of yours to undo.', 'Undone');
+const redo = () => takeStep(() => log.undone.at(-1), 'after', 'before', 'Nothing of yours to do again.', 'Done again');
 
-function takeStep(next, wanted, now, nothing) {
+function takeStep(next, wanted, now, nothing, word) {
   log.stepping = log.stepping.then(async () => {
     const found = next();
     if (!found) return say(nothing);
     if (isCorrecting()) return;
     const other = found[now].map(row => log.held.get(keyOf(row)) ?? takenBack(row)).find((row, k) => !isSameRow(row, found[now][k]));
     if (other) return fail(`${other.who || 'Another person'} has decided about track ${other.track_id} since (${other.decision}): nothing was changed. Decide about it anew.`);
-    if (await decide(found[wanted])) openDecided(found[wanted][0]);
+    if (!await decide(found[wanted])) return;
+    const [{ decision, value, track_id: id }] = found.after;
+    say(`${word}: ${decision} ${value} of track ${id}. What was written before changes with the next labels (Ctrl-S).`);
+    openDecided(found[wanted][0]);
   });
   return log.stepping;
 }
