@@ -160,9 +160,6 @@ class Sink:
         self.boxes_in += count
         self.arrays_in += count > 0
         self.array_stamps_ns.append(given.stamp_ns)
-        for name, boxes in Counter(given.class_names).items():
-            if not self._config.knows_class(name):
-                self.unknown_classes[name] += boxes
         moved = item.moved
         if isinstance(moved, BoxArray):
             place = moved.ticket
@@ -181,6 +178,10 @@ class Sink:
         assert place.boxes is not None
         refined = self.corrections.with_attributes(place.boxes, refined)
         count = len(place.boxes.track_ids)
+        # As decided.
+        for name, boxes in Counter(refined.boxes.class_names[:count]).items():
+            if not self._config.knows_class(name):
+                self.unknown_classes[name] += boxes
         self.boxes_out += len(refined.status)
         self._boxes_added += len(refined.status) - count
         self.arrays_out += len(refined.status) > 0

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from boxreg_ros.config import Config
 from boxreg_ros.errors import ConfigError
 from boxreg_ros.io.storage.urls import url_of
 from boxreg_ros.offline.output import Sink
@@ -21,6 +22,7 @@ from boxreg_ros.offline.reader import JumpingIds, ReadAhead, reader
 from boxreg_ros.offline.request import Request
 from boxreg_ros.offline.result_folder import (
     claimed,
+    CONFIG,
     earlier_summary,
     FILES,
     SUMMARY,
@@ -185,6 +187,14 @@ def _decisions(request: Request, out: Path) -> list[Decision]:
             f'{request.start or 0.0:g} s: its boxes are associated, and their ids depend on the '
             f'first one; relabel with the same start'
         )
+    if ASSOCIATED in reviewed:
+        max_gap = Config.from_yaml(path.parent / CONFIG).max_gap
+        if max_gap != request.config.max_gap:
+            raise ConfigError(
+                f'max_gap: expected {max_gap:g} s, as of the result that {str(path)!r} is about, '
+                f'got {request.config.max_gap:g} s: its boxes are associated, and their ids '
+                f'depend on it; relabel with --set max_gap={max_gap:g}'
+            )
     if request.convention.associate or request.jumping_ids:
         _check_ids(request, is_associated=True)
     return read_decisions(path)

@@ -649,12 +649,14 @@ def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path, ca
     _, stamps, _, out = completed
     decisions = [
         Decision('1', None, 'rename', value='2'),
-        Decision('1', stamps[2], 'reclass', end_ns=stamps[4], value='truck'),
+        Decision('1', stamps[2], 'reclass', end_ns=stamps[4], value='trukc'),
     ]
     run = Run(out.with_name('drive'))
     run(tmp_path / 'out', decisions)
     assert run.status == 0
-    assert "of two boxes of '2' at one stamp one is decided about" in capsys.readouterr().err
+    lines = capsys.readouterr().err
+    assert "of two boxes of '2' at one stamp one is decided about" in lines
+    assert "unknown class names are treated as vehicles: 'trukc' (3 boxes)" in lines
     classes = [one for one in read_decisions(tmp_path / 'out' / APPLIED) if one.kind == 'reclass']
     spans = [(one.stamp_ns, one.end_ns) for one in classes]
     assert all(any(a <= stamps[k] <= b for a, b in spans) for k in (2, 3, 4))

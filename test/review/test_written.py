@@ -215,6 +215,8 @@ def test_ids_of_associated_boxes_count_from_the_same_start(tmp_path, capsys, opt
     assert main([*command, '--start=0']) == 0
     assert main([*command, '--start=0.3']) == status
     assert ('--start: expected 0 s, as of the result' in capsys.readouterr().err) == bool(status)
+    assert main([*command, '--set=max_gap=0.9']) == status
+    assert ('max_gap: expected 1.6 s, as of' in capsys.readouterr().err) == bool(status)
 
 
 @pytest.mark.parametrize(('made_by', 'run_by'), [('--associate', ''), ('', '--associate')])
