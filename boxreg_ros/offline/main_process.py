@@ -104,7 +104,7 @@ class MainProcess:
         summary.fingerprint = fingerprint
         corrections = sink.corrections
         applied = corrections.applied()
-        doubts = [*self.request.doubts_on_decisions(), *corrections.doubts()]
+        doubts = [*self.request.doubts_on_decisions(), *corrections.doubts(summary.is_part)]
         warnings = summary.warning, self.request.unbound_text(), doubts_line(doubts)
         summary.warning = '; '.join(filter(None, warnings))
         if self.sweeps is not None:

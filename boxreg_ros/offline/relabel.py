@@ -165,9 +165,8 @@ def _decisions(request: Request, out: Path) -> list[Decision]:
     """
     Return the decisions that a request names.
 
-    Ids of associated boxes count from the first box of a part: raises ConfigError if the decisions
-    were made on a part that begins elsewhere, where they are about other objects; or if there are
-    none, but the result in `out` has some.
+    Ids of associated boxes count from the first box of a part. Raises ConfigError if the decisions
+    are about other objects, or if there are none, but the result in `out` has some.
 
     """
     path = request.decisions
@@ -179,7 +178,23 @@ def _decisions(request: Request, out: Path) -> list[Decision]:
                 f'delete this one'
             )
         return []
+    _check_result(request, path)
+    if request.convention.associate or request.jumping_ids:
+        _check_ids(request, is_associated=True)
+    return read_decisions(path)
+
+
+def _check_result(request: Request, path: Path) -> None:
+    """Raise ConfigError for decisions on a result whose ids are of other objects here."""
     reviewed = earlier_summary(path.parent) or {}
+    labels = Path() if request.labels is None else request.labels[1].resolve()
+    is_beside = request.labels is not None and path.parent.resolve() in (labels, labels.parent)
+    if is_beside and DECISIONS in reviewed.get(FILES, {}):
+        raise ConfigError(
+            f'--decisions {str(path)!r}: expected decisions about the boxes of the labels, got '
+            f'those that they were made with, which would be applied twice, as to ids that have '
+            f'changed; leave --decisions out, with --labels csv:{path.parent}, or --labels'
+        )
     start = reviewed.get('start', request.start) or 0.0
     if ASSOCIATED in reviewed and start != (request.start or 0.0):
         raise ConfigError(
@@ -195,9 +210,6 @@ def _decisions(request: Request, out: Path) -> list[Decision]:
                 f'got {request.config.max_gap:g} s: its boxes are associated, and their ids '
                 f'depend on it; relabel with --set max_gap={max_gap:g}'
             )
-    if request.convention.associate or request.jumping_ids:
-        _check_ids(request, is_associated=True)
-    return read_decisions(path)
 
 
 def _check_ids(request: Request, is_associated: bool) -> None:

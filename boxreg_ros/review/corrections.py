@@ -78,6 +78,7 @@ class Corrections:
             for one in held(decisions)
             if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
         }
+        self._unseen = {one.track_id for one in earlier}
         self._ranges = _by_track(
             one for one in held(decisions) if one.end_ns is not None and not one.is_taken_back
         )
@@ -95,9 +96,16 @@ class Corrections:
         """Return the tracks and boxes with a decision that the recording does not have."""
         return [text_of(scope) for scope in sorted(self._unused, key=str)]
 
-    def doubts(self) -> list[str]:
-        """Return the boxes that decisions may be about, or may not, in words."""
-        return sorted(self._doubts)
+    def doubts(self, is_part: bool = False) -> list[str]:
+        """
+        Return the boxes that decisions may be about, or may not, in words.
+
+        Tracks with `earlier` decisions may be missing in a part of the recording.
+
+        """
+        names = ', '.join(map(repr, sorted(self._unseen)))
+        missing = f'the labels have decisions on tracks that they do not have: {names}'
+        return [missing] * bool(names and not is_part) + sorted(self._doubts)
 
     def seeds(self, frame_id: str) -> list[BoxArray]:
         """
@@ -294,6 +302,7 @@ class Corrections:
 
         """
         given = given.plain()  # `with_attributes` gives the result its own
+        self._unseen.difference_update(given.track_ids)
         for row, is_pinned in enumerate(given.is_pinned.tolist()):
             track_id = given.track_ids[row]
             self._note_near(track_id, given.stamp_ns)

@@ -592,7 +592,7 @@ def test_tracks_that_swap_their_ends_are_completed_alike_by_later_runs(completed
     assert is_there == [[False] * first + [True] * (SWEEPS - first), [bool(one) for one in after]]
 
 
-def test_a_split_track_that_is_joined_again_is_filled(completed, tmp_path):
+def test_a_split_track_that_is_joined_again_is_filled(completed, tmp_path, capsys):
     _, stamps, _, out = completed
     recording = out.with_name('drive')
     split = [Decision('2', stamps[10], 'rename', end_ns=stamps[-1], value='2_2')]
@@ -601,6 +601,16 @@ def test_a_split_track_that_is_joined_again_is_filled(completed, tmp_path):
     again(tmp_path / '1', [Decision('2_2', None, 'rename', value='2')])
     rows = Run(recording, '--complete', f'--labels=csv:{tmp_path / "1"}')(tmp_path / '2')
     assert '' not in words_of(rows, '2', stamps)
+    table = (tmp_path / '0' / 'boxes.csv').read_text()
+    (tmp_path / '0' / 'boxes.csv').write_text(table.replace(',2_2,', ',77,'))  # by hand
+    capsys.readouterr()
+    Run(recording, f'--labels=csv:{tmp_path / "0"}')(tmp_path / 'by_hand')
+    missing = "the labels have decisions on tracks that they do not have: '2_2'"
+    assert missing in capsys.readouterr().err
+    command = ['relabel', str(recording), '-o', str(tmp_path / '3'), *QUICK]
+    again = ['--labels', f'csv:{tmp_path / "0"}', '--decisions', str(tmp_path / '0' / DECISIONS)]
+    assert main([*command, *again]) == 2
+    assert 'which would be applied twice' in capsys.readouterr().err
 
 
 def in_two_parts():
