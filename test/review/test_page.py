@@ -384,6 +384,23 @@ def test_a_whole_track_is_turned_round_in_one_step(out, serve):
         press(page, 'z', 'log.held.size === 0')
 
 
+def test_a_box_set_in_a_deleted_track_stays_when_another_is_restored(serve):
+    deleted = f'current().deleted === {NUM_SWEEPS}'
+    with serve() as server, opened_page(server.address + '#track=2') as page:
+        press(page, 'd', deleted)
+        page.evaluate('step(5)')
+        page.keyboard.press('e')
+        page.keyboard.press('ArrowUp')
+        press(page, 'Enter', f'{deleted} - 1')
+        page.evaluate('step(3)')
+        press(page, 'Shift+D', f'{deleted} - 2')
+        assert page.evaluate('[3, 4, 5].map(row => isDeleted(...boxAt(row)))') == [
+            False,
+            True,
+            False,
+        ]
+
+
 def test_classes_have_keys_and_tracks_below_a_risk_are_accepted_at_once(out):
     server = review_server([(out, drive_of(out))], 0, 'anna', ['van', 'cargo bike'])
     with serving(server), opened_page(server.address + '#track=2') as page:

@@ -117,7 +117,7 @@ async function remove(isBox) {
   const restored = isBox ? [boxAt(view.row)] : current().members();
   const held = heldOver('deletion', restored);
   // A restored box may be one of a range: the others of it stay deleted.
-  const others = isBox ? current().members().filter(box => box !== restored[0] && held.some(row => row.track_id === inputOf(...box) && covers(row, stampOf(...box)))) : [];
+  const others = isBox ? current().members().filter(box => box !== restored[0] && isDeleted(...box) && held.some(row => row.track_id === inputOf(...box) && covers(row, stampOf(...box)))) : [];
   return decide([...held.map(takenBack), ...deleted(scopesOf(others))]);
 }
 
