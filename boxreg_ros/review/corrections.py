@@ -73,15 +73,10 @@ class Corrections:
         others = (one for one in earlier if one.kind not in STATED)
         self._of_track = _by_track(held([*others, *decisions]))
         self._earlier = _by_track(one for one in earlier if one.kind in STATED)
-        self._unused = {
-            one.scope
-            for one in held(decisions)
-            if one.kind not in WITHOUT_EFFECT and not one.is_taken_back
-        }
+        self._decided = [one for one in held(decisions) if not one.is_taken_back]
+        self._unused = {one.scope for one in self._decided if one.kind not in WITHOUT_EFFECT}
         self._unseen = {one.track_id for one in earlier}
-        self._ranges = _by_track(
-            one for one in held(decisions) if one.end_ns is not None and not one.is_taken_back
-        )
+        self._ranges = _by_track(one for one in self._decided if one.end_ns is not None)
         self._doubts: set[str] = set()  # see `doubts`
         self._extents = self._extents_of_pins()
         self._input_ids: dict[tuple[str, int], str] = {}  # by new id and stamp, where renamed
@@ -105,7 +100,28 @@ class Corrections:
         """
         names = ', '.join(map(repr, sorted(self._unseen)))
         missing = f'the labels have decisions on tracks that they do not have: {names}'
-        return [missing] * bool(names and not is_part) + sorted(self._doubts)
+        empty = [
+            f'{text_of(one.scope)} was given to {one.value!r}, which has no box there: only boxes '
+            f'of the input can be given to another track'
+            for one in self._decided
+            if one.kind == 'rename' and self._is_empty(one)
+        ]
+        return [missing] * bool(names and not is_part) + empty + sorted(self._doubts)
+
+    def _is_empty(self, rename: Decision) -> bool:
+        """Return whether the results have no box of a given id, for no decision of a person."""
+        first_ns, last_ns = _span_of(rename)
+        others = [
+            one
+            for one in self._of_track[rename.track_id]
+            if one.kind in ('delete', 'reject', 'rename') and one is not rename
+        ]
+        spans = map(_span_of, others)
+        stamps_ns = [row.stamp_ns for row in self._of_result.get(rename.value, ())]
+        return rename.scope not in self._unused and not (
+            any(first_ns <= stamp_ns <= last_ns for stamp_ns in stamps_ns)
+            or any(begin_ns <= last_ns and first_ns <= end_ns for begin_ns, end_ns in spans)
+        )
 
     def seeds(self, frame_id: str) -> list[BoxArray]:
         """

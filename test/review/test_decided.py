@@ -223,11 +223,14 @@ def corrected_by_file(followed, folder):
         Decision('1', stamps[2], 'delete'),
         Decision('1', stamps[6], 'pin', '', table.frame_id, pin),
         Decision('1', stamps[0], 'reclass', value='truck'),
+        Decision('1', stamps[9], 'rename', end_ns=stamps[10], value='x'),  # added by the run
     ]
     rows = run(folder / 'after', decisions)
     assert run.status == 0
     classes = [row['class_name'] for (track_id, _), row in rows.items() if track_id == '1']
-    assert classes == ['truck'] + ['car'] * 11
+    assert classes == ['truck'] + ['car'] * 9
+    warning = json.loads((folder / 'after' / 'summary.json').read_text())['warning']
+    assert "was given to 'x', which has no box there" in warning
     return rows, pin
 
 
