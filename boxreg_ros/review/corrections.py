@@ -230,6 +230,12 @@ class Corrections:
         rows = self._earlier.get(track_id, ())
         return {one.topic: one for one in rows if one.covers(stamp_ns)}
 
+    def pause(self, track_id: str) -> float:
+        """Return how long the ranges are whose boxes a person has deleted, together [s]."""
+        rows = self._of_track.get(track_id, ())
+        ranges = [_span_of(one) for one in rows if one.kind == 'delete' and one.end_ns is not None]
+        return sum(last_ns - first_ns for first_ns, last_ns in ranges) * 1e-9
+
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """
         Return whether a box that the input does not have is deleted or rejected.

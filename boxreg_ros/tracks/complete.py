@@ -271,7 +271,9 @@ class _Completer:
         steps = config.complete
         if steps.stitch:
             results = self._exchanged(results)
-        tracks = tracklets_of(results, num_points, self.fixed_frame, config, decided.names)
+        tracks = tracklets_of(
+            results, num_points, self.fixed_frame, config, decided.names, decided.pause
+        )
         if steps.prune:  # first: a duplicate could be stitched to its object
             tracks = self._rejected(tracks, duplicates(tracks, config), Reason.DUPLICATE)
         ambiguous: list[tuple[str, str]] = []

@@ -43,6 +43,10 @@ class Decided(Protocol):
         """Return the class that was given; empty for none."""
         return ''
 
+    def pause(self, track_id: str) -> float:
+        """Return how long the ranges are whose boxes a person has deleted, together [s]."""
+        return 0.0
+
     def is_left_out(self, input_id: str, stamp_ns: int) -> bool:
         """Return whether the box, which the input does not have, is deleted or rejected."""
         return False

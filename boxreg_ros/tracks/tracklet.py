@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from math import inf
@@ -114,6 +114,7 @@ def tracklets_of(
     fixed_frame: str,
     config: Config,
     names: Collection[str] = (),
+    pause: Callable[[str], float] = lambda _: 0.0,
 ) -> list[Tracklet]:
     """
     Return the boxes of a recording, as its results have them, as tracklets in one frame.
@@ -133,6 +134,8 @@ def tracklets_of(
         `max_gap` [s], and the settings of the kinds of objects.
     names : collection of str
         Ids that are of one object each, and split only where they have two boxes at one stamp.
+    pause : callable
+        Returns by how much `max_gap` is longer for an id [s].
 
     Returns
     -------
@@ -163,7 +166,8 @@ def tracklets_of(
     tracklets = []
     taken = set(rows_of)
     for track_id, rows in rows_of.items():
-        parts = _split(every, rows, inf if track_id in names else config.max_gap)
+        max_gap = inf if track_id in names else config.max_gap + pause(track_id)
+        parts = _split(every, rows, max_gap)
         parts.sort(key=len, reverse=True)  # stable: of equal ones the first keeps the id
         for part in parts:
             name = track_id if part is parts[0] else unused_id(track_id, taken)

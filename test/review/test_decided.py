@@ -164,6 +164,10 @@ def test_a_deleted_end_is_not_extended_again(completed, tmp_path):
     rows = run(tmp_path / 'out', [Decision('2', stamps[13], 'delete', end_ns=stamps[15])])
     assert words_of(rows, '2', stamps)[13:] == ['rejected'] * 3
     assert sum(name == '2' for name, _ in rows) == SWEEPS
+    # A stretch that is deleted, longer than `max_gap`, leaves one track.
+    rows = run(tmp_path / 'middle', [Decision('2', stamps[7], 'delete', end_ns=stamps[12])])
+    assert {name for name, _ in rows} == {'1', '2', '9'}
+    assert 'rejected' not in words_of(rows, '2', stamps)[13:]
 
 
 def test_rejected_boxes_that_the_run_added_are_left_out(completed, tmp_path):
