@@ -12,6 +12,12 @@ import numpy as np
 JOIN_NS = 20 * 10**6
 """Box arrays of one stamp that are received within this time are one array [ns]; chosen: they are
 published in a burst, and detectors are slower."""
+REPEAT_NS = 10**9
+"""Messages with a stamp that are received within this time and are equal are one [ns]; derived:
+clocks of recorders differ by less, where NTP sets them, and no recording is played in a shorter
+loop."""
+STAMP_BYTES = slice(4, 12)
+"""Of a message with a header, in the encodings of ROS 1 and 2."""
 
 
 class Repeats:
@@ -21,10 +27,19 @@ class Repeats:
         self._recent = deque[tuple[int, str, bytes]]()
 
     def has(self, received_ns: int, topic: str, data: bytes) -> bool:
-        """Return whether a message, the next by receive time, is equal to one within `JOIN_NS`."""
-        while self._recent and received_ns - self._recent[0][0] > JOIN_NS:
+        """
+        Return whether a message, the next by receive time, is equal to one before it.
+
+        That is within `REPEAT_NS` where it has a stamp, else within `JOIN_NS`.
+
+        """
+        while self._recent and received_ns - self._recent[0][0] > REPEAT_NS:
             self._recent.popleft()
-        is_repeated = any((topic, data) == one[1:] for one in self._recent)
+        within_ns = REPEAT_NS if any(data[STAMP_BYTES]) else JOIN_NS
+        is_repeated = any(
+            received_ns - before_ns <= within_ns and [topic, data] == message
+            for before_ns, *message in self._recent
+        )
         if not is_repeated:
             self._recent.append((received_ns, topic, data))
         return is_repeated

@@ -197,6 +197,12 @@ def _input_notes(summary: Summary) -> Iterator[str]:
         ).replace('box_arrays', 'box arrays')
     if summary.warning:
         yield summary.warning
+    if summary.time_jumps:
+        reason = Reason.TIME_JUMP
+        yield (
+            f'{reason} ({summary.time_jumps:,}): {reason.meaning}; remedy: {reason.remedy}; files '
+            f'of recorders whose clocks differ are mixed up: relabel these one by one'
+        )
     if summary.first_unreadable:
         yield (
             f'{summary.dropped["unreadable"]:,} messages or sweeps could not be read; the rest '

@@ -217,7 +217,7 @@ def test_overlay_of_a_part_has_all_static_transforms(tmp_path):
     assert len(times['/points']) == 5
 
 
-@pytest.mark.parametrize('late_ns', [0, 10**6])
+@pytest.mark.parametrize('late_ns', [0, 10**6, 4 * 10**8])
 def test_messages_of_files_that_overlap_are_read_once(tmp_path, late_ns):
     """As of two recorders, or of one that keeps the time before each event."""
     drive = Drive(sweeps=9)
