@@ -74,11 +74,13 @@ async function judge(kind, isBox) {
 }
 
 async function comment(isBox, text) {
-  const scopes = isBox ? [scopeOfBox(boxAt(view.row))] : chosenScopes(false);
-  return decide(scopes.map(scope => {
+  const box = boxAt(view.row), scopes = isBox ? [scopeOfBox(box)] : chosenScopes(false);
+  // A pin that is stated again does not bring a box back that was deleted since.
+  const deletions = isBox && isDeleted(...box) ? heldOver('deletion', [box]) : [];
+  return decide([...scopes.map(scope => {
     const held = heldOf(scope);
     return rowOf(scope, held?.decision ?? 'none', { comment: text, box: held?.box ?? null });
-  }));
+  }), ...deletions]);
 }
 
 async function acceptAndGoOn() {
