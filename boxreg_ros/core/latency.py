@@ -124,9 +124,9 @@ class Latency(NamedTuple):
             return ''
         changes = ', at the end of a latency that drifts' if self.drifts else ''
         return (
-            f'boxes are {abs(self.seconds):.2f} s {word}{changes}, and moved to where their '
-            f'objects are at their stamps: correct the stamps where they are made, or set '
-            f'sampling.box_time'
+            f'boxes are {abs(self.seconds):.2f} s {word} by the points{changes}, and moved to '
+            f'where their objects are at their stamps: correct the stamps, of boxes or clouds, '
+            f'where they are made; if both are right, set sampling.box_time=stamp'
         )
 
     @property
@@ -512,6 +512,8 @@ def _lidars_apart(samples: Collection[_Sample]) -> str:
     of_sensor: dict[int, list[_Sample]] = {}
     for sample in samples:
         of_sensor.setdefault(sample.sensor, []).append(sample)
+    if len(of_sensor) < 2:
+        return ''
     known = {sensor: _Comparisons.of(some) for sensor, some in sorted(of_sensor.items())}
     for one, other in combinations(known, 2):
         before, after = _estimated(known[one]), _estimated(known[other])

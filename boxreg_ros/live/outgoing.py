@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.session import covariances_to_write, refined_to_frame, Session
 from boxreg_ros.io.transforms import boxes_to_frame
 from boxreg_ros.live.following import Following
@@ -138,7 +137,7 @@ def labels_passed_through(message: Any, adapter: Adapter, session: Session) -> R
     """
     try:
         boxes = adapter.from_msg(message)
-    except UnsupportedMessage:
+    except Exception:  # it was reported when the message arrived
         return None
     T_fixed_boxes = session.tree.find(session.fixed_frame, boxes.frame_id, boxes.stamp_ns)
     if T_fixed_boxes is None:

@@ -9,6 +9,7 @@ from boxreg_ros.io.lidars import Lidars, SensorPlacement, SINGLE_LIDAR
 from boxreg_ros.io.session import refined_to_frame, Session
 from boxreg_ros.io.transforms import matrix
 from boxreg_ros.live.bursts import JOIN_TIME
+from boxreg_ros.live.outgoing import labels_passed_through
 from boxreg_ros.live.pipeline import MessagePipeline
 from boxreg_ros.live.transform_wait import TransformWait
 from boxreg_ros.structures import BoxArray, COASTED, KEPT, REFINED, RefinedBoxes
@@ -690,3 +691,14 @@ def test_a_concatenated_cloud_waits_for_its_info_while_there_are_infos():
     assert are_ready() == [True, True, True]
     live.session.placement.add_info(infos[2])  # there are infos again
     assert are_ready() == [False, True, True]
+
+
+def test_a_message_that_cannot_be_read_has_no_labels():
+    class Unreadable:
+        def from_msg(self, msg):
+            raise RuntimeError('an adapter of another package')
+
+    message = next(message for topic, _, message in Drive(1).items if topic == '/boxes')
+    session = Live('odom').session
+    assert labels_passed_through(message, adapter_for(DETECTIONS), session) is not None
+    assert labels_passed_through(message, Unreadable(), session) is None
