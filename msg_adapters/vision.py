@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from boxreg_ros.errors import UnsupportedMessage
-from boxreg_ros.structures import BoxArray, Floats
+from boxreg_ros.structures import BOX_CENTER, BoxArray, Floats
 from msg_adapters import poses
 from msg_adapters.box_fields import (
     BoxFields,
@@ -121,14 +121,27 @@ def _from_detections(msg: Any) -> BoxArray:
             f'{error}; convert the messages to vision_msgs 4'
         ) from None
     boxes = [detection.bbox for detection in msg.detections]
+    values = poses.boxes_of([box.center for box in boxes], [box.size for box in boxes])
+    if not values[:, BOX_CENTER].any() and any(map(_has_pose, msg.detections)):
+        raise UnsupportedMessage(
+            'Detection3DArray: expected the poses of the boxes in bbox.center, got all of them at '
+            'the origin, and poses in results[].pose: copy these to bbox.center, and the sizes to '
+            'bbox.size, where the message is published'
+        )
     return BoxArray(
         poses.stamp_ns(header),
         header.frame_id,
         track_ids,
         tuple(class_name for class_name, _ in best),
         np.array([score for _, score in best], dtype=np.float64),
-        poses.boxes_of([box.center for box in boxes], [box.size for box in boxes]),
+        values,
     )
+
+
+def _has_pose(detection: Any) -> bool:
+    """Return whether a hypothesis of a detection has a pose that is not the origin."""
+    found = [getattr(result.pose, 'pose', result.pose).position for result in detection.results]
+    return any(p.x or p.y or p.z for p in found)
 
 
 def _with_box(bbox: Any, box: Floats, quaternion_xyzw: Floats) -> Any:

@@ -310,6 +310,16 @@ def test_detection_without_hypothesis():
     assert (boxes.class_names[0], boxes.scores[0]) == ('', 1.0)
 
 
+def test_poses_in_the_hypotheses_alone_are_named():
+    message = vision_msg()
+    for detection in message.detections:
+        for result in detection.results:
+            result.pose.pose = detection.bbox.center
+        detection.bbox.center = M.pose()
+    with pytest.raises(UnsupportedMessage, match=r'got all of them at the origin.*to bbox.center'):
+        vision.from_msg(message)
+
+
 def test_array_without_frame_uses_the_header_of_its_detections():
     message = vision_msg()
     message.header = M.header(0, '')
