@@ -272,8 +272,8 @@ class Reason(StrEnum):
     )
     NOT_FINITE = _reason(
         'box',
-        'the solution of its window is not finite',
-        'check stamps and coordinates of the boxes',
+        'the solution of its window is not finite, or an extent of it is not positive',
+        'check stamps, coordinates and ids of the boxes',
     )
     BUDGET = _reason(
         'box',
