@@ -21,7 +21,7 @@ TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 """Possible units of point times [s], coarsest first."""
 AUTO = 'auto'
 TIME_UNIT_CHOICES = (AUTO, *TIME_UNITS)
-POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_stamp')
+POINT_TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_offset', 'time_stamp')
 MAX_TIME_OFFSET = 1.0
 """Largest difference between the time of a point and the stamp [s]; one revolution is shorter."""
 MIN_DURATION = 1e-3

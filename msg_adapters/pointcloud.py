@@ -57,12 +57,12 @@ def from_msg(msg: Any, time_unit: str = AUTO) -> Sweep:
     -----
     The layouts of `point_layout.LAYOUTS` state field and unit of the times. In other layouts times
     are read from the first of the fields ``t``, ``time``, ``timestamp``, ``offset_time``,
-    ``time_stamp``; unit and origin are derived from type and magnitude. A float64 field within 1 s
-    of the stamp in s, ms, us or ns is absolute. Other fields are relative to the stamp, in the
-    coarsest of these units in which all points are within 1 s of it; seconds only for floats. If
-    none fits, ``times`` is None. A point whose time is not finite, or far from those of the
-    others, gets the time of the stamp. Where `is_bigendian` contradicts the coordinates, these
-    decide.
+    ``time_offset``, ``time_stamp``; unit and origin are derived from type and magnitude. A float64
+    field within 1 s of the stamp in s, ms, us or ns is absolute. Other fields are relative to the
+    stamp, in the coarsest of these units in which all points are within 1 s of it; seconds only
+    for floats. If none fits, ``times`` is None. A point whose time is not finite, or far from
+    those of the others, gets the time of the stamp. Where `is_bigendian` contradicts the
+    coordinates, these decide.
 
     """
     stamp = stamp_ns(msg.header)

@@ -66,7 +66,7 @@ def test_points_that_are_not_finite_are_removed_with_their_times():
 SECONDS = np.array([-0.01, 0.0, 0.05, 0.09])
 
 
-@pytest.mark.parametrize('name', ['t', 'time', 'timestamp', 'offset_time'])
+@pytest.mark.parametrize('name', ['t', 'time', 'timestamp', 'offset_time', 'time_offset'])
 @pytest.mark.parametrize(
     ('kind', 'values', 'accuracy'),
     [
