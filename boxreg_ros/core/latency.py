@@ -269,26 +269,25 @@ class LatencyEvidence:
 
     def _steady_offsets(self) -> Floats:
         """
-        Return by how much boxes may be stamped behind their sweeps [s], ascending.
+        Return by how much boxes are stamped behind the sweep they may be of [s].
 
-        By the nearest sweeps, and by those so many periods before and behind them as are
-        compared. Empty if it is no steady time.
+        That is the nearest one; of half a period, the one before it or behind it. Empty if it is
+        no steady time.
 
         """
         boxes_ns, sweeps_ns = np.array(self._stamps, np.int64).reshape(-1, 2).T
         steps = np.diff(np.unique(sweeps_ns))
         if not len(steps):
             return np.empty(0)
-        period = float(np.median(steps)) * 1e-9
+        period = float(np.quantile(steps, 0.1)) * 1e-9  # sweeps without boxes make others longer
         offsets = (boxes_ns - sweeps_ns) * 1e-9
         # Of half a period, either sweep may be the nearest one.
         offsets = offsets[0] + np.remainder(offsets - offsets[0] + period / 2, period) - period / 2
         low, middle, high = np.quantile(offsets, (0.1, 0.5, 0.9))
         if high - low > STEADY_SPREAD:
             return np.empty(0)
-        first, last = np.ceil((CANDIDATES[ENDS] - middle) / period)
-        found: Floats = middle + period * np.arange(first, last)
-        return found
+        found: Floats = middle + period * np.arange(-1, 2)
+        return found[np.abs(found) <= period / 2 + STEADY_SPREAD]
 
     def _compare(self, sweep: Sweep, tracks: MeasuredTracks) -> None:
         """Compare the points of a sweep with the boxes of objects that move in their frame."""
