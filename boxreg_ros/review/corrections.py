@@ -474,7 +474,7 @@ class Corrections:
             if any(a.stamp_ns == b.stamp_ns and a[3:] != b[3:] for a, b in pairwise(rows)):
                 self._doubts.add(
                     f'of two boxes of {track_id!r} at one stamp one is decided about, which later '
-                    f'runs cannot tell from the other'
+                    f'runs cannot distinguish from the other one'
                 )
             if track_id in apart:  # also boxes that a step has added
                 rows = [one._replace(track_id=track_id) for one in rows]
