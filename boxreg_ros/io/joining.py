@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import replace
 
-from boxreg_ros.structures import BOX_CENTER, BoxArray, LENGTH
+from boxreg_ros.structures import BOX_CENTER, BoxArray, concatenated, LENGTH
 import numpy as np
 
 JOIN_NS = 20 * 10**6
@@ -72,19 +71,7 @@ def are_parts(boxes: BoxArray, more: BoxArray) -> bool:
 
 def joined(boxes: BoxArray, more: BoxArray) -> BoxArray:
     """Return the boxes of two arrays of one stamp and frame."""
-    return replace(
-        boxes,
-        track_ids=boxes.track_ids + more.track_ids,
-        class_names=boxes.class_names + more.class_names,
-        scores=np.concatenate([boxes.scores, more.scores]),
-        boxes=np.concatenate([boxes.boxes, more.boxes]),
-        attributes=_both_attributes(boxes, more),
-    )
-
-
-def _both_attributes(boxes: BoxArray, more: BoxArray) -> tuple[Mapping[str, str], ...]:
-    if not (boxes.attributes or more.attributes):
-        return ()
-    return tuple(
-        one.attributes_of(row) for one in (boxes, more) for row in range(len(one.track_ids))
-    )
+    both = boxes, more
+    attributes = [one.attributes_of(row) for one in both for row in range(len(one.track_ids))]
+    whole = concatenated([one.plain() for one in both])
+    return replace(whole, attributes=tuple(attributes) if any(attributes) else ())
