@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import NamedTuple
 
-from boxreg_ros.io.checks.pose import PairedCheck, POINT_MARGIN, points_around
+from boxreg_ros.io.checks.pose import PairedCheck, points_around
+from boxreg_ros.io.checks.size import POINT_MARGIN
 from boxreg_ros.io.clocks import seconds_text
 from boxreg_ros.rotations import matrix_from_rpy, wrap_angle
 from boxreg_ros.structures import (

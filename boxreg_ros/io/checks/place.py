@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from boxreg_ros.io.checks.finding import advice
-from boxreg_ros.io.checks.pose import PairedCheck, POINT_MARGIN, points_around
+from boxreg_ros.io.checks.pose import PairedCheck, points_around
+from boxreg_ros.io.checks.size import coverage
 from boxreg_ros.io.transforms import boxes_to_frame, inverse, moved_boxes
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
@@ -27,10 +28,6 @@ ENOUGH_BOXES = 12
 """Boxes with points around them that a finding needs; chosen."""
 MAX_COMPARED = 100
 """Boxes after which the check ends; chosen: a second of 10 boxes at 10 Hz."""
-MIN_POINTS_AROUND = 10
-"""Points around a box that it is counted from; chosen."""
-GROUND_MARGIN = 0.2
-"""Points up to this height above the bottom of a box may be of the road [m]; chosen."""
 MIN_COVERAGE = 0.5
 """
 Part of the points around them that boxes must contain to be in the right place.
@@ -285,10 +282,6 @@ def _add_coverages(place: _Place, points: NDArray[np.floating], boxes: Floats) -
             continue
         reach = 1.1 * float(np.linalg.norm(box[BOX_EXTENT]))
         away = points_around(points, box[BOX_CENTER], reach)
-        local = away @ matrix_from_rpy(box[ROLL:])
-        limit = box[BOX_EXTENT] / 2
-        local = local[local[:, 2] > GROUND_MARGIN - limit[2]]
-        num_around = int((np.abs(local) <= 2 * limit).all(axis=1).sum())
-        if num_around >= MIN_POINTS_AROUND:
-            num_inside = int((np.abs(local) <= limit + POINT_MARGIN).all(axis=1).sum())
-            place.coverages.append(min(1.0, num_inside / num_around))
+        found = coverage(away @ matrix_from_rpy(box[ROLL:]), box[BOX_EXTENT] / 2)
+        if found is not None:
+            place.coverages.append(found)

@@ -6,7 +6,13 @@ from dataclasses import dataclass, field, replace
 
 from boxreg_ros.core.matching import AT_ONCE
 from boxreg_ros.io.checks.finding import advice, advice_for_some, listed
-from boxreg_ros.io.checks.size import counts_of, ENLARGED, SizeCounts, SizeEvidence
+from boxreg_ros.io.checks.size import (
+    counts_of,
+    ENLARGED,
+    POINT_MARGIN,
+    SizeCounts,
+    SizeEvidence,
+)
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import (
     BOX_CENTER,
@@ -28,8 +34,6 @@ MAX_BOXES = 300
 """After this number of boxes, with points or without, the check ends."""
 MIN_POINTS_OF_POSE = 10
 """Points that the best convention must have in a box for the box to be counted."""
-POINT_MARGIN = 0.1
-"""Points up to this distance outside of a box are of its object [m]: range noise and labels."""
 EQUIVALENT_SHARE = 0.85
 """A convention with this share of the points of the best one counts as equal to it."""
 MIN_GAIN = 1.3

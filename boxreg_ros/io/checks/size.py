@@ -26,7 +26,7 @@ MIN_SIZE_POINTS = 10
 """Points of a box, or around it, that it is counted from; chosen."""
 ROAD_HEIGHT = 0.2
 """Points up to this far above the bottom or centre of a box may be of the road [m]; chosen."""
-SIZE_MARGIN = 0.1
+POINT_MARGIN = 0.1
 """Points up to this far outside of a box are of its object [m]; chosen, for noise and labels."""
 ENLARGED = 1.4
 """Factor of the extents of a larger box; chosen, between those of fitting and of half boxes."""
@@ -94,19 +94,29 @@ def counts_of(is_inside: NDArray[np.bool_], local: Floats, extent: Floats) -> Si
     upper = is_inside[:, local[:, 2] > ROAD_HEIGHT].sum(axis=1)
     if upper.max() < MIN_SIZE_POINTS:
         return None
-    coverages = [_coverage(local, extent * scale) for scale in (0.5, 1.0)]
+    coverages = [coverage(local, extent * scale) or 0.0 for scale in (0.5, 1.0)]
     reach = np.abs(local[local[:, 2] > 0] / (extent / 2)).max(axis=1, initial=0)
     reach = reach[reach <= 1]
     within = float(np.mean(reach <= MAX_FILLED)) if len(reach) >= MIN_SIZE_POINTS else None
     return SizeCounts(np.array([*(upper / upper.max()), *coverages]), within)
 
 
-def _coverage(local: Floats, limit: Floats) -> float:
-    """Return the part of the points around a box with half extents `limit` that it contains."""
+def coverage(local: Floats, limit: Floats) -> float | None:
+    """
+    Return the part of the points around a box that it contains; None if they are few.
+
+    Parameters
+    ----------
+    local : array, shape (M, 3)
+        The points by the axes of the box, from its centre [m].
+    limit : array, shape (3,)
+        Half of its extents [m].
+
+    """
     away = np.abs(local[local[:, 2] > ROAD_HEIGHT - limit[2]])
     around = int((away <= 2 * limit).all(axis=1).sum())
-    inside = int((away <= limit + SIZE_MARGIN).all(axis=1).sum())
-    return min(1.0, inside / around) if around >= MIN_SIZE_POINTS else 0.0
+    inside = int((away <= limit + POINT_MARGIN).all(axis=1).sum())
+    return min(1.0, inside / around) if around >= MIN_SIZE_POINTS else None
 
 
 @dataclass(slots=True)
