@@ -268,7 +268,8 @@ class Reason(StrEnum):
         'contains NaN or infinity, an extent that is not positive or above 1 km, a position '
         'beyond 30,000 km, or a quaternion that is not of unit length, such as one of zeros',
         'check the detector, and its units; without rotation a quaternion is x=0 y=0 z=0 w=1; '
-        'polygons of Autoware have no length and width, and stay as they are',
+        'polygons of Autoware, and shapes of derived_object_msgs that are no BOX, have no length '
+        'and width, and stay as they are',
     )
     NOT_FINITE = _reason(
         'box',

@@ -2,8 +2,8 @@
 ``derived_object_msgs``: ObjectArray and ObjectWithCovarianceArray.
 
 The track id is `id`, the score the certainty of the classification. The pose is the centre of the
-shape, whose dimensions are length, width and height. Objects that are not a BOX of three
-dimensions are skipped when reading; when writing, they only change their frame.
+shape, whose dimensions are length, width and height. An object that is not a BOX of three
+dimensions is an invalid box when read; when written, it only changes its frame.
 
 """
 
@@ -47,7 +47,7 @@ def from_msg(msg: Any) -> BoxArray:
 
     """
     poses.require_fields('ObjectArray', msg.objects[:1], REQUIRED_FIELDS)
-    objects = [o for o in msg.objects if _is_box(o)]
+    objects = msg.objects
     header = poses.common_header('ObjectArray', msg.header, objects)
     return BoxArray(
         poses.stamp_ns(header),
@@ -55,7 +55,7 @@ def from_msg(msg: Any) -> BoxArray:
         tuple(str(o.id) for o in objects),
         tuple(_class_name(o) for o in objects),
         np.array([_score(o) for o in objects]),
-        poses.boxes_of([_pose(o) for o in objects], [o.shape.dimensions for o in objects]),
+        poses.boxes_of([_pose(o) for o in objects], [_size(o) for o in objects]),
     )
 
 
@@ -71,8 +71,7 @@ def to_msg(
     quaternions_xyzw = poses.quaternions_of(boxes.boxes)
     kinematics = boxes.kinematics
     objects = []
-    i = 0  # index of the next box
-    for o in msg.objects:
+    for i, o in enumerate(msg.objects):
         pose = poses.moved(_pose(o), T_out_in)
         size = o.shape.dimensions
         covariance = None
@@ -85,7 +84,6 @@ def to_msg(
                 own = kinematics[i : i + 1]
                 twist = poses.with_motion(twist, 'twist', own, 'velocity')
                 accel = poses.with_motion(accel, 'accel', own, 'acceleration')
-            i += 1
         if hasattr(o.pose, 'covariance'):
             pose = poses.with_covariance(o.pose, pose, covariance, T_out_in)
         objects.append(
@@ -106,11 +104,11 @@ def to_msg(
 
 def with_added(msg: Any, sources: Sequence[tuple[Any, int]]) -> Any:
     """Return a copy with objects of earlier messages added; see `Adapter.with_added`."""
-    header = poses.common_header('ObjectArray', msg.header, [*filter(_is_box, msg.objects)])
-    added = []
-    for source, row in sources:
-        o = [*filter(_is_box, source.objects)][row]
-        added.append(poses.replaced(o, header=header, classification_certainty=0))
+    header = poses.common_header('ObjectArray', msg.header, msg.objects)
+    added = [
+        poses.replaced(source.objects[row], header=header, classification_certainty=0)
+        for source, row in sources
+    ]
     return poses.replaced(msg, objects=[*msg.objects, *added])
 
 
@@ -121,6 +119,11 @@ def _name_of(number: int) -> str:
 
 def _is_box(o: Any) -> bool:
     return o.shape.type == BOX and len(o.shape.dimensions) == SIZE_WIDTH
+
+
+def _size(o: Any) -> Sequence[float]:
+    """Return the extents of a box [m]; NaN for another shape, which makes it an invalid box."""
+    return o.shape.dimensions if _is_box(o) else (np.nan,) * SIZE_WIDTH
 
 
 def _class_name(o: Any) -> str:

@@ -349,13 +349,14 @@ def test_unknown_labels_and_zero_uuids():
     assert boxes.track_ids == ('0' * 31 + '1', '')
 
 
-def test_objects_that_are_not_boxes_are_skipped_and_transformed():
+def test_objects_that_are_not_boxes_are_invalid_boxes_and_transformed():
     message = message_of(OBJECTS)
     message.objects[0].shape.type = 2
     message.objects[0].shape.dimensions = np.array([0.5])
     adapter = adapter_for(OBJECTS)
     boxes = adapter.from_msg(message)
-    assert boxes.track_ids == ('2',)
+    assert boxes.track_ids == ('1', '2')
+    assert is_valid_box(boxes.boxes).tolist() == [False, True]
     T = np.eye(4)
     T[:2, :2], T[:3, 3] = [[0, -1], [1, 0]], [100.0, 0.0, 0.0]
     out = adapter.to_msg(message, moved_boxes(boxes, 'map'), None, T)
@@ -366,7 +367,9 @@ def test_objects_that_are_not_boxes_are_skipped_and_transformed():
         [position.x, position.y, twist.x, twist.y], [102.0, 10.0, 0.0, 3.0], atol=1e-9
     )
     assert {o.header.frame_id for o in out.objects} == {'map'}
-    np.testing.assert_allclose(adapter.from_msg(out).boxes, moved_boxes(boxes).boxes, atol=1e-9)
+    np.testing.assert_allclose(
+        adapter.from_msg(out).boxes[1:], moved_boxes(boxes).boxes[1:], atol=1e-9
+    )
 
 
 def test_scene_entities_with_several_cubes_or_none():
