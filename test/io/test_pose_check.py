@@ -4,8 +4,9 @@ from dataclasses import replace
 from itertools import product
 
 from boxreg_ros.errors import ConfigError
+from boxreg_ros.io.checks.finding import ADVISED
 from boxreg_ros.io.checks.place import PlaceCheck
-from boxreg_ros.io.checks.pose import DECISIVE_BOXES, PoseCheck
+from boxreg_ros.io.checks.pose import DECISIVE_BOXES, MANY_BOXES, PoseCheck
 from boxreg_ros.io.transforms import boxes_to_frame, inverse
 from boxreg_ros.structures import BoxArray, KINEMATICS, Sweep
 from msg_adapters import adapter_for
@@ -288,13 +289,33 @@ def test_a_class_that_arrives_later_is_checked_and_one_that_is_decided_is_not():
     boxes, points = scene()
     wrong = Convention('bottom').from_centers(array_of(*boxes))
     check = PoseCheck(STANDARD)
-    arrays = [array_of(*boxes), wrong, replace(wrong, class_names=('van',) * 16)]
+    many = -(-MANY_BOXES // len(boxes))
+    arrays = [*[array_of(*boxes)] * many, wrong, replace(wrong, class_names=('van',) * 16)]
     findings = []
     for k, array in enumerate(arrays):
         check.add(Sweep(STAMP + k * 10**8, 'map', points))
         check.add(replace(array, stamp_ns=STAMP + k * 10**8))
         findings.append((check.finding, check.class_finding.partition(' stand')[0]))
-    assert findings == [('', ''), ('', ''), ('', "boxes of 'van'")]
+    assert findings == [*[('', '')] * (many + 1), ('', "boxes of 'van'")]
+
+
+@pytest.mark.parametrize(('still', 'is_advised'), [(0, None), (4, False), (16, True)])
+def test_late_boxes_of_objects_that_move_are_no_poses_at_their_rears(still, is_advised):
+    """Of 16 boxes those of moving objects are late, or all at their rears where none moves."""
+    boxes, points = scene()
+    moves = np.arange(16) >= still
+    late = Convention('rear').from_centers(array_of(*boxes)).boxes
+    if moves.any():
+        late[:still] = boxes[:still]
+    nearest = np.linalg.norm(points[:, None, :2] - boxes[:, :2], axis=2).argmin(axis=1)
+    check = PoseCheck(STANDARD)
+    for k in range(MANY_BOXES // 16 + 2):
+        step = [2.0 * k, 0, 0]
+        check.add(Sweep(STAMP + k * 10**8, 'map', points + moves[nearest, None] * step))
+        check.add(array_of(*late, stamp_ns=STAMP + k * 10**8))
+        late[moves, 0] += 2
+    assert bool(check.finding) == (is_advised is not False)
+    assert bool(ADVISED.search(check.finding)) == bool(is_advised)
 
 
 def test_noisy_boxes_give_no_finding():
