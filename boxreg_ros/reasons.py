@@ -194,8 +194,10 @@ class Reason(StrEnum):
     OBJECTS_TWICE = _reason(
         'message',
         'most of its objects have two boxes with an id each, as of two detectors or trackers on '
-        'one topic; each is refined by itself',
-        'publish the boxes of one of them on this topic, or join them before this node',
+        'one topic; each is refined by itself; or its boxes are those of the message before, as '
+        'of a timer',
+        'publish the boxes of one of them on this topic, and each once, or join them before this '
+        'node',
     )
     CLOCK_OFFSET = _reason(
         'message',

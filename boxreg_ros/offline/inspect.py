@@ -292,6 +292,11 @@ def _summary(sample: _Sample) -> dict[str, Any]:
 def _warnings(sample: _Sample, finding: str, recording: ItemSource) -> Iterator[str]:
     """Yield the conditions that make results worse, one line each."""
     yield from filter(None, (recording.finding, finding))
+    if sample.arrays and not sample.classes:
+        yield (
+            f'{len(sample.arrays)} box arrays without a box (of a MarkerArray, markers of the '
+            f'type CUBE are boxes)'
+        )
     if sample.without_id:
         yield f'{sample.without_id} boxes have no track id; --associate assigns them'
     if sample.invalid:

@@ -399,3 +399,25 @@ def test_objects_with_two_boxes_are_named(kind, apart, second, is_named, message
             session.admit(Item(0, array))
     assert ('boxes: expected one for each object' in session.finding) == is_named
     assert [one.reason for one in session.findings] == ['objects_twice'] * is_named
+
+
+@pytest.mark.parametrize(
+    ('changes', 'is_named'),
+    [
+        ([k % 2 == 0 for k in range(30)], True),  # 5 Hz, published at 10 Hz
+        ([True] * 30, False),
+        ([k % 30 < 8 for k in range(90)], False),  # all objects of a drive stop, three times
+    ],
+)
+@pytest.mark.parametrize('has_parked', [False, True])
+def test_boxes_that_are_published_again_later_are_named(changes, is_named, has_parked):
+    session = Session(STANDARD, Config(), 'map')
+    for k, number in enumerate(np.cumsum(changes)):
+        ids, names, boxes = zip(*objects_of('car', 6, 20.0, seed=number), strict=True)
+        if has_parked:  # a car whose box is always the same, as if it were rounded
+            boxes[0][:] = objects_of('car', 1, 20.0)[0][2]
+        array = BoxArray(START + k * SECOND // 10, 'map', ids, names, np.ones(len(ids)), boxes)
+        session.admit(Item(0, array))
+    is_found = is_named and not has_parked
+    assert ('those of the one before' in session.finding) == is_found
+    assert [one.reason for one in session.findings] == ['objects_twice'] * is_found

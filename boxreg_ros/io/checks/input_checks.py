@@ -15,7 +15,7 @@ from boxreg_ros.io.checks.motion_time import MotionTimeCheck
 from boxreg_ros.io.checks.place import PlaceCheck
 from boxreg_ros.io.checks.pose import PoseCheck
 from boxreg_ros.io.checks.stamps import StampCheck
-from boxreg_ros.io.checks.twice import TwiceCheck
+from boxreg_ros.io.checks.twice import RepeatCheck, TwiceCheck
 from boxreg_ros.io.checks.unit import UnitCheck
 from boxreg_ros.io.id_assignment import Tracker
 from boxreg_ros.io.lidars import Lidars
@@ -45,6 +45,7 @@ class InputChecks:
         self._axis = AxisCheck(convention, config.drives)
         self._common_motion = CommonMotionCheck()
         self._twice = TwiceCheck(config)
+        self._repeat = RepeatCheck()
         self._stamps: dict[str, StampCheck] = {}  # by topic of clouds
         self.restart()
 
@@ -95,7 +96,9 @@ class InputChecks:
         """
         fixed_frame = moved.frame_id
         pose_of_sensor = partial(self._tree.find, fixed_frame, sensor_frame)
-        if isinstance(given, Sweep):
+        if isinstance(given, BoxArray):
+            self._repeat.add(given)
+        else:
             self._cloud.add(given)
             self._motion.add_pose(given, fixed_frame, T_fixed_item)
             stamps = self._stamps.setdefault(given.topic, StampCheck())
@@ -151,6 +154,6 @@ class InputChecks:
             (Reason.CLOCK_OFFSET, '' if 'clock' in known else self._motion_time.finding),
             (Reason.TRANSFORM_FAULT, self._place.fallen),
             (Reason.POSE_REFERENCE, poses),
-            (Reason.OBJECTS_TWICE, self._twice.finding),
+            (Reason.OBJECTS_TWICE, self._twice.finding or self._repeat.finding),
         ]
         return [*known.values(), *(Finding(reason, text) for reason, text in texts if text)]

@@ -1,4 +1,4 @@
-"""Check of boxes that lie on one another: two detectors or trackers on one topic."""
+"""Checks of boxes that are published twice: by two detectors or trackers, or again and again."""
 
 from __future__ import annotations
 
@@ -25,6 +25,61 @@ MIN_SHARE_TWICE = 0.3
 """Part of the boxes of a kind; chosen: where one detector sees half as far it is half of them."""
 MAX_LOOKED = 3000
 """After this number of boxes the check ends; chosen: 5 s of 60 boxes at 10 Hz."""
+
+MIN_REPEATED = 0.3
+"""Part of the arrays that repeat the one before; chosen: of 10 Hz published at 15 Hz a third."""
+MIN_HOLDS = 5
+"""New arrays that are repeated; chosen: more than the stops of all objects of a scene."""
+MIN_HELD_BOXES = 2
+"""Boxes of an array that is compared: a single one may stand still, now and then."""
+MAX_MIXED = 0.1
+"""Part of the arrays with boxes that are as before and others that are not; chosen: parked ones
+are so in the fixed frame, if they are rounded."""
+
+
+class RepeatCheck:
+    """
+    Find arrays that repeat the boxes before them at a later stamp, as timers publish them.
+
+    Their boxes are where objects were before. All of them are equal, then all are new.
+
+    """
+
+    def __init__(self) -> None:
+        self._stamp_ns = 0
+        self._last = set[bytes]()
+        self._was_new = False
+        self._new = self._repeated = self._mixed = self._holds = 0
+
+    def add(self, boxes: BoxArray) -> None:
+        """Add the next boxes, in the frame of their message."""
+        own = {box.tobytes() for box in boxes.boxes}
+        last, self._last = self._last, own
+        is_later = boxes.stamp_ns > self._stamp_ns
+        self._stamp_ns = boxes.stamp_ns
+        if not is_later or min(len(own), len(last)) < MIN_HELD_BOXES:
+            return
+        is_repeated, is_new = own == last, own.isdisjoint(last)
+        self._holds += is_repeated and self._was_new
+        self._new += is_new
+        self._repeated += is_repeated
+        self._mixed += not (is_new or is_repeated)
+        self._was_new = is_new
+
+    @property
+    def finding(self) -> str:
+        """Return that boxes are repeated; empty if they are not."""
+        total = self._new + self._repeated + self._mixed
+        is_rare = self._holds < MIN_HOLDS or self._repeated < MIN_REPEATED * total
+        if is_rare or self._mixed > MAX_MIXED * total:
+            return ''
+        return (
+            f'boxes: expected new ones in each message, got those of the one before with a later '
+            f'stamp in {self._repeated:,} of {total:,}, as of a timer: they are where their '
+            f'objects were before; publish them once, with the stamp of their cloud, or leave '
+            f'the repeated ones out of the boxes.csv that boxreg convert RECORDING#TOPIC --from '
+            f'recording --to csv writes and boxreg relabel --labels csv:FOLDER reads'
+        )
 
 
 class TwiceCheck:
