@@ -63,5 +63,4 @@ def with_cameras(drive):
         )  # fmt: skip
         drive.items.append(('/rear/image_rect', stamp, message))
         drive.items.append(('/rear/camera_info', stamp, info(m, stamp, 'back')))
-    drive.items.sort(key=lambda item: item[1])
     return drive

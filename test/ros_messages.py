@@ -387,8 +387,9 @@ class Drive:
         self.replace('/boxes', index, add)
 
     def write(self, path, storage='mcap'):
-        """Write the recording and return its path."""
-        return write_recording(path, self.items, storage, self.messages)
+        """Write the recording as it is received and return its path."""
+        received = sorted(self.items, key=lambda item: item[1])
+        return write_recording(path, received, storage, self.messages)
 
 
 def _surface(box, rng):

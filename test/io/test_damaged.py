@@ -323,9 +323,7 @@ def test_messages_of_no_topic_are_counted(tmp_path, drive):
 
 def test_a_topic_whose_definition_was_not_found(tmp_path, drive):
     drive.items.append(('/talk', START, drive.messages.header(START, 'x')))
-    folder = write_recording(
-        tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]), 'sqlite3'
-    )
+    folder = drive.write(tmp_path / 'drive', 'sqlite3')
     with closing(sqlite3.connect(database_of(folder))) as database:
         database.execute(
             "UPDATE message_definitions SET encoding = 'unknown', encoded_message_definition = '' "

@@ -16,7 +16,7 @@ from ros_messages import Drive, SECOND, START, write_recording
 
 def read(drive, tmp_path, fixed_frame=None, convention=STANDARD, **options):
     """Return positions of the sensor by stamp, the fixed frame and all findings of a drive."""
-    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    path = drive.write(tmp_path / 'drive')
     with Recording([path], convention=convention, **options) as recording:
         items = FixedFrameItems(recording, Config(), convention, fixed_frame)
         moved = [item.moved for item in items.read()]
@@ -51,7 +51,6 @@ def robots(sweeps, numbers, space='/r{}', shift=20.0):
             stamp = START + k * SECOND // 10 + 30_000_000
             message = m.tf(m.transform(stamp, 'odom', 'base', (shift * number + 0.5 * k, 0, 0)))
             drive.items.append((f'{space.format(number)}/tf', stamp, message))
-    drive.items.sort(key=lambda item: item[1])
     return drive
 
 
@@ -95,7 +94,6 @@ def test_a_copy_of_tf_and_frames_with_prefixes_are_no_second_robot(tmp_path):
             stamp = received + 1
             other = m.tf(m.transform(stamp, '/r2/odom', '/r2/base', (20, 0, 0)))
             drive.items.append(('/r2/tf', stamp, other))
-    drive.items.sort(key=lambda item: item[1])
     origins, _, found = read(drive, tmp_path)
     assert_true(origins, 8)
     assert not found
@@ -132,7 +130,6 @@ def test_a_frame_of_one_of_two_prefixes_needs_a_choice(tmp_path):
         poses = [('r1', 0.5 * k), ('r2', 20)]
         stated = [m.transform(stamp, f'{r}/odom', f'{r}/lidar', (x, 0, 2)) for r, x in poses]
         drive.items.insert(0, ('/tf', stamp, m.tf(*stated)))
-    drive.items.sort(key=lambda item: item[1])
     with pytest.raises(RecordingError, match='--fixed-frame r1/odom or r2/odom'):
         read(drive, tmp_path)
     origins, _, found = read(drive, tmp_path / 'asked', fixed_frame='r1/odom')
@@ -219,7 +216,6 @@ def test_one_of_several_lidars_with_another_clock_is_named(tmp_path, seconds, is
         for topic, at, cloud in rear.items
         if topic == '/points'
     ]
-    drive.items.sort(key=lambda item: item[1])
     origins, _, found = read(drive, tmp_path, lidars=Lidars(('/points', '/rear')))
     assert 'clocks: expected one for all LiDARs' in found
     assert f'/rear is {"0.53 s ahead" if seconds > 0 else "0.5 s behind"}:' in found
@@ -243,7 +239,6 @@ def test_motion_with_stamps_of_clouds_may_be_late_in_place_of_another_clock(tmp_
         stamps_moved(drive, ('/tf',), 0.037)
     late = SECOND // 2
     drive.items = [(name, at + late * (name == '/tf'), one) for name, at, one in drive.items]
-    drive.items.sort(key=lambda item: item[1])
     found = read(drive, tmp_path)[2]
     assert '--clock-offset=0.' in found
     assert ('computed from these clouds' in found) == is_copied
@@ -257,7 +252,7 @@ def test_boxes_from_the_future_have_another_clock(tmp_path, seconds):
     assert f'stamps of the boxes {seconds:g} s ahead of those of the clouds' in found
     assert f'--boxes-offset={-seconds:g}' in found
     convention = Convention(boxes_offset=-seconds)
-    path = write_recording(tmp_path / 'corrected', drive.items, messages=drive.messages)
+    path = drive.write(tmp_path / 'corrected')
     with Recording([path], convention=convention) as recording:
         items = FixedFrameItems(recording, Config(), convention)
         stamps = [item.content.stamp_ns for item in items.read()]
@@ -277,7 +272,6 @@ def test_boxes_whose_stamps_are_of_no_cloud_have_a_clock_that_is_behind(tmp_path
     stamps_moved(drive, ('/boxes',), -seconds)
     late = 30_000_000  # of the detector
     drive.items = [(name, at + late * (name == '/boxes'), one) for name, at, one in drive.items]
-    drive.items.sort(key=lambda item: item[1])
     found = read(drive, tmp_path)[2]
     offset = {18.04: 18, 36.98: 37}.get(seconds, seconds)
     assert f'stamps of the boxes {offset} s behind those of the clouds' in found
@@ -307,7 +301,7 @@ def test_boxes_with_stamps_of_earlier_clouds_are_those_of_a_slow_detector(tmp_pa
     delayed = [(t, ns + slow_ns * (t == '/boxes'), message) for t, ns, message in drive.items]
     kept = [item for item in delayed if item[0] != '/points' or item[1] >= first_ns]
     drive.items = sorted((i for i in kept if i[1] <= last_ns), key=lambda item: item[1])
-    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    path = drive.write(tmp_path / 'drive')
     with Recording([path]) as recording:
         items = FixedFrameItems(recording, Config())
         given = [item.content for item in items.read()]
@@ -325,7 +319,6 @@ def test_delays_of_a_common_clock_are_no_finding(tmp_path):
     drive = Drive(sweeps=20)
     delays = {'/points': 200_000_000, '/boxes': 500_000_000}
     drive.items = [(t, ns + delays.get(t, 0), message) for t, ns, message in drive.items]
-    drive.items.sort(key=lambda item: item[1])
     origins, _, found = read(drive, tmp_path)
     assert_true(origins, 20)
     assert not found
@@ -338,7 +331,6 @@ def with_map(drive, position_of, every=1):
         if k % every == 0:
             message = m.tf(m.transform(stamp, 'map', 'odom', position_of(k)))
             drive.items.append(('/tf', stamp, message))
-    drive.items.sort(key=lambda item: item[1])
     return drive
 
 
@@ -353,7 +345,6 @@ def test_a_static_transform_that_is_repeated_on_tf_is_no_motion(tmp_path):
     for stamp in drive.stamps:
         message = m.tf(m.transform(stamp, 'above', sensor, (0, 0, 0)))
         drive.items.append(('/tf', stamp, message))
-    drive.items.sort(key=lambda item: item[1])
     origins, frame, found = read(drive, tmp_path)
     assert frame == 'odom' and not found
     assert_true(origins, 20)
@@ -392,7 +383,6 @@ def test_a_jump_that_rotates_the_map_is_found(tmp_path):
         drive.items.append(
             ('/tf', stamp, m.tf(m.transform(stamp, 'map', 'odom', (0, 0, 0), turn)))
         )
-    drive.items.sort(key=lambda item: item[1])
     assert read(drive, tmp_path)[1] == 'odom'
 
 
@@ -465,7 +455,6 @@ def test_a_fixed_frame_of_a_sensor_that_stands_is_not(tmp_path):
     for k, stamp in enumerate(drive.stamps):  # a localisation that corrects the place of `base`
         place = (0.02 * k, 0, 0)
         drive.items.append(('/tf', stamp, m.tf(m.transform(stamp, 'map', 'base', place))))
-    drive.items.sort(key=lambda item: item[1])
     assert not read(drive, tmp_path, fixed_frame='base')[2]
 
 
@@ -558,7 +547,6 @@ def test_publishers_that_disagree_by_less_than_a_metre_are_named_too(tmp_path, d
     for k, stamp in enumerate(drive.stamps):
         at = stamp + delay_ns
         drive.items.append(('/tf', at, m.tf(m.transform(at, 'odom', 'base', (0.5 * k, 0.4, 0)))))
-    drive.items.sort(key=lambda item: item[1])
     assert 'two publishers state it' in read(drive, tmp_path)[2]
 
 
@@ -575,7 +563,6 @@ def test_positions_that_contradict_each_other_at_one_stamp_are_named(tmp_path, c
         for k, stamp in enumerate(drive.stamps):
             message = m.tf(m.transform(stamp, 'odom', 'base', (0.5 * k, 0.1, 0)))
             drive.items.append(('/tf', stamp, message))
-        drive.items.sort(key=lambda item: item[1])
     found = read(drive, tmp_path)[2]
     assert 'transform odom -> base: expected one position at each stamp' in found
 
@@ -594,7 +581,6 @@ def test_a_static_transform_published_once_on_tf_is_used_at_all_times(tmp_path):
     drive.items = [item for item in drive.items if item[0] != '/tf_static']
     late = START + 3 * SECOND // 10
     drive.items.append(('/tf', late, m.tf(m.transform(late, 'base', 'lidar', (0, 0, 2)))))
-    drive.items.sort(key=lambda item: item[1])
     origins, _, found = read(drive, tmp_path)
     assert_true(origins, 20)
     assert 'base -> lidar was published once on a topic of moving transforms' in found
@@ -618,7 +604,6 @@ def test_a_frame_with_two_parents_is_named_and_either_may_be_chosen(tmp_path):
     for k, stamp in enumerate(drive.stamps):
         message = m.tf(m.transform(stamp + 1, 'map', 'base', (100 + 0.5 * k, 0, 0)))
         drive.items.append(('/tf', stamp + 1, message))
-    drive.items.sort(key=lambda item: item[1])
     origins, frame, found = read(drive, tmp_path)
     assert frame == 'odom'
     assert_true(origins, 20)
@@ -634,7 +619,6 @@ def test_a_loop_of_transforms_is_named_and_the_frame_that_moves_is_not_the_root(
     m = drive.messages
     for stamp in drive.stamps:
         drive.items.append(('/tf', stamp, m.tf(m.transform(stamp, child, 'odom', (9, 0, 0)))))
-    drive.items.sort(key=lambda item: item[1])
     origins, frame, found = read(drive, tmp_path)
     assert frame == 'odom'
     assert_true(origins, 12)
@@ -667,7 +651,6 @@ def test_static_transforms_that_contradict_each_other_are_named(tmp_path, turn):
     quaternion = (0, 0, np.sin(turn / 2), np.cos(turn / 2))
     again = m.tf(m.transform(late, 'base', 'lidar', (0, 0, 2), quaternion))
     drive.items.append(('/tf_static', late, again))
-    drive.items.sort(key=lambda item: item[1])
     text = 'transform base -> lidar: expected one static pose, got others'
     assert (text in read(drive, tmp_path)[2]) == (turn > 0)
 
@@ -682,7 +665,6 @@ def with_sparse_transforms(sweeps):
     for k, stamp in enumerate(drive.stamps):
         # Not where TF has it, to see which of both is used.
         drive.items.append(('/odom', stamp, m.odometry(stamp, 'odom', 'base', (0.5 * k, 9, 0))))
-    drive.items.sort(key=lambda item: item[1])
     return drive
 
 
@@ -715,7 +697,6 @@ def test_odometry_of_another_frame_is_refused(tmp_path):
     drive = Drive(sweeps=8)
     m = drive.messages
     drive.items.append(('/odom', START, m.odometry(START, 'odom', 'trailer', (0, 9, 0))))
-    drive.items.sort(key=lambda item: item[1])
     with pytest.raises(RecordingError, match=r'got /odom \(odom -> trailer\)'):
         read(drive, tmp_path, odometry='/odom')
 
@@ -725,7 +706,7 @@ def test_boxes_without_a_frame_are_taken_to_be_in_that_of_the_clouds(tmp_path):
     for topic, _, message in drive.items:
         for one in (message, *message.detections) if topic == '/boxes' else ():
             one.header.frame_id = ''
-    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    path = drive.write(tmp_path / 'drive')
     with Recording([path]) as recording:
         items = FixedFrameItems(recording, Config())
         moved = [item.moved for item in items.read()]
@@ -755,7 +736,7 @@ def test_an_array_stamped_0_has_the_stamp_of_its_boxes(tmp_path):
     for topic, _, message in drive.items:
         if topic == '/boxes':
             message.header.stamp.sec = message.header.stamp.nanosec = 0
-    path = write_recording(tmp_path / 'drive', drive.items, messages=drive.messages)
+    path = drive.write(tmp_path / 'drive')
     with Recording([path]) as recording:
         items = FixedFrameItems(recording, Config())
         given = [item.content for item in items.read(with_clouds=False)]

@@ -173,7 +173,7 @@ def test_odometry_of_the_sensor_frame_needs_no_tf(tmp_path):
     drive.items += [
         ('/odom', stamp, M.odometry(stamp, 'world', 'lidar', (1, 2, 3))) for stamp in drive.stamps
     ]
-    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    path = drive.write(tmp_path / 'drive')
     tree = TransformTree()
     assert read(path, tree)[2] == 'world'
     np.testing.assert_array_equal(tree.lookup('world', 'lidar', START)[:3, 3], [1, 2, 3])
@@ -199,7 +199,7 @@ def test_tf_is_preferred_to_odometry(tmp_path):
     for stamp in drive.stamps:
         drive.items.append(('/odom', stamp, M.odometry(stamp, 'wheels', 'base', (99, 0, 0))))
         drive.items.append(('/odom2', stamp, M.odometry(stamp, 'wheels2', 'base', (99, 0, 0))))
-    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    path = drive.write(tmp_path / 'drive')
     assert read(path)[2] == 'odom'
     assert read(path, odometry='/odom', fixed_frame='wheels')[2] == 'wheels'
 
@@ -209,7 +209,7 @@ def test_several_odometry_topics_are_listed_in_the_error(tmp_path):
     for stamp in drive.stamps:
         drive.items.append(('/fused', stamp, M.odometry(stamp, 'map', 'base', (0, 0, 0))))
         drive.items.append(('/other', stamp, M.odometry(stamp, 'map', 'wheel', (0, 0, 0))))
-    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    path = drive.write(tmp_path / 'drive')
     text = error_of(path)
     assert '/fused, /odom;' in text
     assert '--odometry' in text
@@ -222,7 +222,7 @@ def test_odometry_of_the_root_frame_of_tf(tmp_path):
     for stamp in drive.stamps:
         drive.items.append(('/tf', stamp, M.tf(M.transform(stamp, 'footprint', 'base'))))
         drive.items.append(('/odom', stamp, M.odometry(stamp, 'odom', 'footprint')))
-    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    path = drive.write(tmp_path / 'drive')
     assert read(path)[2] == 'odom'
 
 
@@ -361,7 +361,7 @@ def test_several_topics_of_one_kind_are_listed_in_the_error(tmp_path):
     drive.items += [
         ('/rear', stamp, message) for t, stamp, message in drive.items if t == '/points'
     ]
-    path = write_recording(tmp_path / 'drive', sorted(drive.items, key=lambda item: item[1]))
+    path = drive.write(tmp_path / 'drive')
     text = error_of(path)
     assert '/points, /rear' in text
     assert '--points' in text

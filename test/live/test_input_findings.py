@@ -75,7 +75,6 @@ def test_what_is_wrong_with_the_input_is_counted_and_logged(
     drive = Drive(sweeps=SWEEPS)
     for change in changes:
         change(drive)
-    drive.items.sort(key=lambda item: item[1])
     records = records_of(drive.write(tmp_path / 'drive'))
     # Which frame is chosen by default depends on the transforms that arrive first.
     arguments = ('-p', f'fixed_frame:={frame}', '-p', 'transform_timeout:=0.2')

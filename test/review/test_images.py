@@ -187,7 +187,6 @@ def test_images_are_read_with_the_model_beside_them(tmp_path, ros1):
                              data=np.zeros(9, np.uint8))),
     ]  # fmt: skip
     drive.items += [(topic, start, message) for topic, message in odd]
-    drive.items.sort(key=lambda item: item[1])
     with Recording([drive.write(tmp_path / 'drive', 'bag' if ros1 else 'mcap')]) as recording:
         images = recording.images()
         by_topic = {camera.topic: camera for camera in images.cameras}
