@@ -107,3 +107,18 @@ def press(page, key, until, **options):
     """Press a key, and wait until an expression holds on the page."""
     page.keyboard.press(key)
     page.wait_for_function(until, **options)
+
+
+def open_box(page, track_id, row):
+    """Open a box of a track, with the focus in the views."""
+    page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
+    page.wait_for_function(f"view.part && current().id === '{track_id}'")
+    page.locator('#top').focus()
+
+
+def answer(page, text):
+    """Give the text that the page asks for."""
+    page.wait_for_selector('#ask[open]')
+    page.fill('#ask-text', text)
+    page.keyboard.press('Enter')
+    page.wait_for_selector('#ask[open]', state='detached')

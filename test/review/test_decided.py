@@ -18,7 +18,7 @@ from boxreg_ros.review.changes import Changes
 from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray, kept
-from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
+from browser import answer, NEEDS_BROWSER, open_box, opened_page, press, serving, show_charts
 import numpy as np
 import pytest
 from relabel_results import rows_in
@@ -108,13 +108,6 @@ def test_rejected_boxes_are_no_labels(completed, capsys):
     labels = {track.track_id: track.labels for track in changes.tracks()}
     assert np.isfinite(labels['1']).all()
     assert np.isnan(labels['9']).all()
-
-
-def open_box(page, track_id, row):
-    """Open a box of a track, with the focus in the views."""
-    page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
-    page.wait_for_function(f"view.part && current().id === '{track_id}'")
-    page.locator('#top').focus()
 
 
 def rules_of(summary):
@@ -309,9 +302,7 @@ def delete_and_join(page):
     press(page, 's', "current().id === '1_2'")
     open_box(page, '1', 0)
     page.keyboard.press('j')
-    page.wait_for_selector('#ask[open]')
-    page.fill('#ask-text', '1_2')
-    page.keyboard.press('Enter')
+    answer(page, '1_2')
     page.wait_for_function("!TRACKS.some(track => track.id === '1_2')")
 
 
@@ -342,9 +333,7 @@ def test_decisions_of_the_page_are_all_in_the_labels_that_it_writes(
         page.keyboard.press('b')
         page.evaluate('step(2)')
         page.keyboard.press('k')
-        page.wait_for_selector('#ask[open]')
-        page.fill('#ask-text', 'truck')
-        page.keyboard.press('Enter')
+        answer(page, 'truck')
         page.wait_for_function('log.made.length === 9')
         open_box(page, '2', 10)
         press(page, 's', "current().id === '2_2'")
@@ -464,9 +453,8 @@ def test_attributes_are_set_in_the_page(completed, tmp_path):
         press(page, 'b', 'view.mark === 2')
         page.evaluate('step(4)')
         page.keyboard.press('x')
-        page.wait_for_selector('#ask[open]')
-        page.fill('#ask-text', 'weather=rain')
-        press(page, 'Enter', "attributesAt(3).weather === 'rain' && view.mark === null")
+        answer(page, 'weather=rain')
+        page.wait_for_function("attributesAt(3).weather === 'rain' && view.mark === null")
         assert page.evaluate('[attributesAt(1), attributesAt(5)]') == [{'parked': 'true'}] * 2
         page.keyboard.press('x')
         page.wait_for_selector('#ask[open]')
@@ -475,9 +463,8 @@ def test_attributes_are_set_in_the_page(completed, tmp_path):
         press(page, 'z', 'attributesAt(3).weather === undefined')
         press(page, 'y', "attributesAt(3).weather === 'rain'")
         page.keyboard.press('x')
-        page.wait_for_selector('#ask[open]')
-        page.fill('#ask-text', 'parked=')
-        press(page, 'Enter', 'attributesAt(3).parked === undefined')
+        answer(page, 'parked=')
+        page.wait_for_function('attributesAt(3).parked === undefined')
         press(page, 'z', "attributesAt(3).parked === 'true'")
     found = [(one.stamp_ns, one.end_ns, one.value) for one in read_decisions(out / DECISIONS)]
     assert found[:2] == [(None, None, 'parked=true'), (stamps[2], stamps[4], 'weather=rain')]

@@ -8,7 +8,7 @@ from boxreg_ros.cli import main
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import Decision, DecisionLog, DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, press, serving
+from browser import answer, NEEDS_BROWSER, opened_page, press, serving
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -407,9 +407,8 @@ def test_classes_have_keys_and_tracks_below_a_risk_are_accepted_at_once(out):
         press(page, '2', "current().class === 'cargo bike'")
         page.keyboard.press('9')  # there is none
         page.keyboard.press('k')
-        page.wait_for_selector('#ask[open]')
-        page.fill('#ask-text', 'vna')
-        press(page, 'Enter', "$('failure').textContent.startsWith('No class vna in the list')")
+        answer(page, 'vna')
+        page.wait_for_function("$('failure').textContent.startsWith('No class vna in the list')")
         page.keyboard.press('k')
         shown = page.locator('#ask-proposals button').all_inner_texts()
         assert shown == ['1 van', '2 cargo bike']
@@ -418,8 +417,7 @@ def test_classes_have_keys_and_tracks_below_a_risk_are_accepted_at_once(out):
         given = page.evaluate("DATA.tracks.find(track => track.id === '2').class")
         press(page, 'z', f'current().class === {given!r}')
         page.click('#accept-below')
-        page.fill('#ask-text', '9')
-        page.keyboard.press('Enter')
+        answer(page, '9')
         page.wait_for_function('TRACKS.every(track => decidedOf(track) === "accept")')
         assert page.inner_text('#notice').startswith('2 tracks accepted')
         press(page, 'z', 'TRACKS.every(track => !decidedOf(track))')

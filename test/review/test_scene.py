@@ -17,7 +17,7 @@ from boxreg_ros.review.decisions import APPLIED, Decision, DecisionLog, DECISION
 from boxreg_ros.review.fit import drawn, fitted, USUAL_EXTENTS
 from boxreg_ros.review.server import review_server
 from boxreg_ros.structures import BoxArray
-from browser import NEEDS_BROWSER, opened_page, press, serving, show_charts
+from browser import answer, NEEDS_BROWSER, opened_page, press, serving, show_charts
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -132,8 +132,8 @@ def test_a_missing_object_is_added_corrected_and_in_every_label(drive, out, serv
         page.evaluate('step(5)')
         press(page, 'Shift+D', 'current().deleted === 1')
         page.keyboard.press('k')
-        page.fill('#ask-text', 'van')
-        press(page, 'Enter', "current().class === 'van'")
+        answer(page, 'van')
+        page.wait_for_function("current().class === 'van'")
         page.keyboard.press('r')
         assert 'no input to keep' in page.inner_text('#failure')
         # The page opened again follows it again.

@@ -14,7 +14,15 @@ from boxreg_ros.labels import frames_of
 from boxreg_ros.offline.review_command import drive_of
 from boxreg_ros.review.decisions import DECISIONS, read_decisions
 from boxreg_ros.review.server import review_server
-from browser import NEEDS_BROWSER, opened_page, other_page, press, serving
+from browser import (
+    answer,
+    NEEDS_BROWSER,
+    open_box,
+    opened_page,
+    other_page,
+    press,
+    serving,
+)
 import numpy as np
 import pytest
 from ros_messages import Drive
@@ -60,25 +68,11 @@ def ids_of(page):
     return page.evaluate('TRACKS.map(track => track.id)')
 
 
-def open_track(page, track_id, row):
-    page.evaluate(f"openTrack(TRACKS.findIndex(t => t.id === '{track_id}'), null, {row})")
-    page.wait_for_function(f"view.part && current().id === '{track_id}'")
-    page.locator('#top').focus()
-
-
-def answer(page, text):
-    """Give the text that the page asks for."""
-    page.wait_for_selector('#ask[open]')
-    page.fill('#ask-text', text)
-    page.keyboard.press('Enter')
-    page.wait_for_selector('#ask[open]', state='detached')
-
-
 def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
     with opened_page(server.address + '#track=1') as page:
         assert sorted(ids_of(page)) == ['1', '2']
         lengths = 'TRACKS.map(track => track.path.length).sort((a, b) => a - b)'
-        open_track(page, '1', 8)
+        open_box(page, '1', 8)
         press(page, 's', 'TRACKS.length === 3')
         assert sorted(ids_of(page)) == ['1', '1_2', '2']
         page.wait_for_function("current().id === '1_2'")
@@ -92,7 +86,7 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         page.wait_for_function("current().class === 'van'")
         assert 'van' in page.inner_text('#title')
         # A range of boxes, then one of it back.
-        open_track(page, '1', 2)
+        open_box(page, '1', 2)
         page.keyboard.press('b')
         page.evaluate('step(4)')
         press(page, 'Shift+D', 'current().deleted === 3')
@@ -109,11 +103,11 @@ def test_tracks_are_split_joined_renamed_and_deleted_and_all_is_undone(server):
         for count in (2, 1, 0):
             press(page, 'z', f'log.made.length === {count}')
         page.wait_for_function('TRACKS.length === 2 && log.held.size === 0')
-        open_track(page, '1', 8)
+        open_box(page, '1', 8)
         page.click(DO.format('split'))
         page.wait_for_function('TRACKS.length === 3')
         # A split track is a continuation of its rest, which is proposed.
-        open_track(page, '1', 0)
+        open_box(page, '1', 0)
         page.keyboard.press('j')
         page.wait_for_selector('#ask[open]')
         proposed = page.locator('#ask-proposals button').first.inner_text()
@@ -128,14 +122,14 @@ def test_labels_are_written_with_all_decisions_without_a_terminal(server):
     before = BoxTable.read(out / 'boxes.csv')
     stamps = [stamp for (stamp,) in boxes_of(before, '1', 'stamps_ns')]
     with opened_page(server.address + '#track=1') as page:
-        open_track(page, '1', 8)
+        open_box(page, '1', 8)
         press(page, 's', "current().id === '1_2'")
         page.keyboard.press('k')
         answer(page, 'van')
         page.wait_for_function("current().class === 'van'")
-        open_track(page, '1', 3)
+        open_box(page, '1', 3)
         press(page, 'Shift+D', 'current().deleted === 1')
-        open_track(page, '2', 0)
+        open_box(page, '2', 0)
         press(page, 'd', 'isGone(current())')
         assert page.locator('#rows tr.gone').count() == 1
         press(page, 'Control+s', "$('notice').textContent.includes('boxes in')")
