@@ -182,7 +182,9 @@ def assert_equal_boxes(found, expected):
     assert difference.max() < 1e-6
 
 
-def late(drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0, swapped=False):
+def late(
+    drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0, swapped=False, gap=(0, 0)
+):
     """
     Return a drive whose boxes are stamped and received later, up to the last transform.
 
@@ -191,14 +193,22 @@ def late(drive, seconds, jitter=0.0, frame='lidar', lost=(), behind=0.0, swapped
     `jitter` [s] is the largest deviation from `seconds`; boxes in the frame odom are where their
     objects were. The clouds of the sweeps in `lost` are left out. Where `swapped`, every second
     cloud is received after the next one and its boxes. The first such cloud has no boxes: whether
-    these wait for it depends on which of both the node receives first.
+    these wait for it depends on which of both the node receives first. With a `gap` the vehicle
+    drives curves that tighten, without transforms from its first sweep on until the last one.
 
     """
     rng = np.random.default_rng(0)
     lost_ns = {drive.stamps[k] for k in lost}
     last_ns = max(received for topic, received, _ in drive.items if topic == '/tf')
+    first_ns, end_ns = (drive.stamps[k] for k in gap)
     items = []
     for topic, received, message in drive.items:
+        if topic == '/tf' and end_ns > first_ns:
+            (transform,) = message.transforms
+            after = (stamp_of(transform) - first_ns) / SECOND
+            transform.transform.translation.y += after**3 / 3
+            if 0 <= after < (end_ns - first_ns) / SECOND:
+                continue
         if topic != '/boxes':
             is_lost = topic in ('/points', '/front', '/rear') and stamp_of(message) in lost_ns
             if swapped and topic == '/points' and drive.stamps.index(stamp_of(message)) % 2:
@@ -231,6 +241,7 @@ LATE = {
     'in time, clouds swapped': (0.0, {'swapped': True}),
     '30 ms behind clouds': (0.03, {}),
     '50 ms before clouds': (-0.05, {}),
+    'in time, no transforms for 0.4 s': (0.0, {'gap': (12, 15)}),
     'late, behind the last transform': (0.5, {'behind': 1.0}),
 }
 

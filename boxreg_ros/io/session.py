@@ -75,7 +75,8 @@ class Session:
     def __post_init__(self) -> None:
         """Begin with no message."""
         convention, config = self.convention, self.config
-        self.tree = TransformTree()
+        # The node, whose estimates are the others, has no transforms of later.
+        self.tree = TransformTree(looks_ahead=config.estimate == 'track')
         self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them

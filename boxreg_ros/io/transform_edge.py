@@ -112,10 +112,11 @@ class Edge:
 
     """
 
-    def __init__(self, parent: str, child: str, buffer_ns: int) -> None:
+    def __init__(self, parent: str, child: str, buffer_ns: int, looks_ahead: bool = True) -> None:
         self.parent = parent
         self.child = child
         self._buffer_ns = buffer_ns
+        self._looks_ahead = looks_ahead
         self.is_static = False
         self.stamps: list[int] = []
         self.poses: list[Floats] = []
@@ -227,7 +228,7 @@ class Edge:
     def _keep_before(self, stamp_ns: int) -> None:
         """Keep the samples behind a stamp that time goes back to, for clouds and boxes of then."""
         first = bisect_right(self.stamps, stamp_ns + round(TIME_JUMP * 1e9))
-        self._before = Edge(self.parent, self.child, self._buffer_ns)
+        self._before = Edge(self.parent, self.child, self._buffer_ns, self._looks_ahead)
         self._before.stamps, self._before.poses = self.stamps[first:], self.poses[first:]
 
     def forget_before(self) -> None:
@@ -412,6 +413,7 @@ class Edge:
 
         Over a long gap there is a further one on each side, where it is known, about as far apart
         as the gap is long: the noise of a nearer one would be multiplied by the ratio of both.
+        That behind the gap is left out where messages are processed as soon as the gap has ended.
 
         """
         before = after - 1
@@ -425,7 +427,7 @@ class Edge:
         if earlier >= 0 and stamps[before] - stamps[earlier] <= limit_ns:
             nodes.insert(0, earlier)
         later = max(bisect_right(stamps, stamps[after] + gap_ns) - 1, after + 1)
-        if later < len(stamps) and stamps[later] - stamps[after] <= limit_ns:
+        if self._looks_ahead and later < len(stamps) and stamps[later] - stamps[after] <= limit_ns:
             nodes.append(later)
         return nodes
 

@@ -68,12 +68,13 @@ class TransformTree:
     `buffer_duration` [s]. After a time jump of a pair, new samples replace the old ones, which are
     kept for stamps more than `TIME_JUMP` ahead of these until `forget_before` or `rewind`. Between
     samples, positions are interpolated linearly and orientations along the shortest rotation, as
-    tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples
-    on each side. Up to `MAX_EXTRAPOLATION` outside of them the motion is extrapolated. A
-    moving frame with one sample only counts as static once others are newer. Of a frame that has
-    two parents at once, the transforms to both are kept. Where nothing else connects two frames,
-    those whose names differ by one and the same prefix, as ``r1/lidar`` and ``lidar``, are taken
-    for one; `same_frames` has them. Not thread-safe.
+    tf2 does; over gaps longer than `MAX_LINEAR_GAP` by the polynomial through up to two samples on
+    each side, or one behind the gap unless the tree `looks_ahead`. Up to `MAX_EXTRAPOLATION`
+    outside of them the motion is extrapolated. A moving frame with one sample only counts as
+    static once others are newer. Of a frame that has two parents at once, the transforms to both
+    are kept. Where nothing else connects two frames, those whose names differ by one and the same
+    prefix, as ``r1/lidar`` and ``lidar``, are taken for one; `same_frames` has them. Not
+    thread-safe.
 
     A sample whose stamp is far ahead of its pair, which its time of receipt does not explain,
     waits for the next one to confirm it. `clock_offset` [s] is added to the stamps of moving
@@ -83,8 +84,9 @@ class TransformTree:
 
     """
 
-    def __init__(self, buffer_duration: float = BUFFER_DURATION) -> None:
+    def __init__(self, buffer_duration: float = BUFFER_DURATION, looks_ahead: bool = True) -> None:
         self._buffer_ns = round(buffer_duration * 1e9)
+        self._looks_ahead = looks_ahead
         self.clock_offset = 0.0
         self.prefers_odometry = False
         self.odometry_child = ''
@@ -474,7 +476,7 @@ class TransformTree:
         frame = frames.get(child)
         edge = None if frame is None else frame.edge_to(parent)
         if edge is None:
-            edge = Edge(parent, child, self._buffer_ns)
+            edge = Edge(parent, child, self._buffer_ns, self._looks_ahead)
             if frame is None:
                 frames[child] = Attachment(edge)
             else:
