@@ -194,10 +194,14 @@ class Reason(StrEnum):
     OBJECTS_TWICE = _reason(
         'message',
         'most of its objects have two boxes with an id each, as of two detectors or trackers on '
-        'one topic; each is refined by itself; or its boxes are those of the message before, as '
-        'of a timer',
-        'publish the boxes of one of them on this topic, and each once, or join them before this '
-        'node',
+        'one topic; each is refined by itself',
+        'publish the boxes of one of them on this topic, or join them before this node',
+    )
+    BOXES_REPEATED = _reason(
+        'message',
+        'many of its messages repeat the boxes before them at a later stamp, as a timer publishes '
+        'them: they are where their objects were before',
+        'publish boxes once, with the stamp of their cloud',
     )
     CLOCK_OFFSET = _reason(
         'message',

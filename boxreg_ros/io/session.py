@@ -75,7 +75,7 @@ class Session:
     def __post_init__(self) -> None:
         """Begin with no message."""
         convention, config = self.convention, self.config
-        # The node, whose estimates are the others, has no transforms of later.
+        # The node estimates early and final boxes before it has transforms from behind a gap.
         self.tree = TransformTree(looks_ahead=config.estimate == 'track')
         self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''

@@ -420,4 +420,4 @@ def test_boxes_that_are_published_again_later_are_named(changes, is_named, has_p
         session.admit(Item(0, array))
     is_found = is_named and not has_parked
     assert ('those of the one before' in session.finding) == is_found
-    assert [one.reason for one in session.findings] == ['objects_twice'] * is_found
+    assert [one.reason for one in session.findings] == ['boxes_repeated'] * is_found

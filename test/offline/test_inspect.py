@@ -84,6 +84,15 @@ def test_why_no_command_can_be_run(tmp_path, capsys):
     assert 'no boxes' in lines[-1]
 
 
+def test_arrays_without_a_box_are_named(tmp_path, capsys):
+    drive = Drive(boxes='markers')
+    for _, _, array in (item for item in drive.items if item[0] == '/boxes'):
+        for marker in array.markers:
+            marker.type = marker.LINE_LIST
+    assert main(['inspect', str(drive.write(tmp_path / 'drive'))]) == 0
+    assert f'warning: {len(drive.stamps)} box arrays without a box' in capsys.readouterr().out
+
+
 def test_warnings_gaps_and_damage(tmp_path, capsys):
     drive = Drive(sweeps=30)
     drive.items = [

@@ -154,6 +154,7 @@ class InputChecks:
             (Reason.CLOCK_OFFSET, '' if 'clock' in known else self._motion_time.finding),
             (Reason.TRANSFORM_FAULT, self._place.fallen),
             (Reason.POSE_REFERENCE, poses),
-            (Reason.OBJECTS_TWICE, self._twice.finding or self._repeat.finding),
+            (Reason.OBJECTS_TWICE, self._twice.finding),
+            (Reason.BOXES_REPEATED, self._repeat.finding),
         ]
         return [*known.values(), *(Finding(reason, text) for reason, text in texts if text)]

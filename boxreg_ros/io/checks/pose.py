@@ -155,8 +155,9 @@ class _Evidence:
         if not (fits.any() and self.prefers(best, 0)):
             return 0
         still = self.still
-        is_shown = self.is_above[best] or not still.is_shown[best] or still._exceeds(best, 0)
-        return best if is_shown else 0  # else boxes of those that move are late
+        if self.is_above[best] or not still.is_shown[best] or still._exceeds(best, 0):
+            return best
+        return 0  # the boxes of those that move are late
 
     @property
     def still(self) -> _Evidence:
@@ -358,8 +359,8 @@ class PoseCheck(PairedCheck):
         advised = advice(name, expected)
         if not (self._is_above[index] or all(one.still.is_shown[index] for one in evidence)):
             advised = (
-                'most of these objects move, and their boxes may be late or early instead: use '
-                f'boxreg relabel without an option first, which finds that; else {advised}'
+                'most of these objects move: their boxes may be late or early instead, which '
+                f'boxreg relabel without options says; if it does not, {advised}'
             )
         return f'{seen}: expected {name} {expected!r}, got {got!r}; {advised}{instead}'
 
