@@ -266,6 +266,16 @@ class ObservedTrack:
         """Stamp of the newest observation [ns]."""
         return self.entries[-1].stamp_ns
 
+    @property
+    def is_estimated(self) -> bool:
+        """Whether all observations have been in a window."""
+        return not self.num_carried and len(self.starts) == len(self.seen)
+
+    def settle(self) -> None:
+        """Let no estimate in the box arrays change any more."""
+        for entry in self.entries:
+            entry.settle()
+
     def add(self, one: PendingBox, observation: Observation) -> None:
         """Add the newest observation."""
         self.entries.append(one)

@@ -136,7 +136,8 @@ class BoxRegistrar:
     estimated when some track has `track_window` observations, together with all tracks of more
     than half as many. A track ends after `max_gap` without an observation, when its id is given
     to another object, or, with 'track', at `flush`. It is then estimated a last time with the next
-    windows, which settles all its observations.
+    windows, which settles all its observations; with 'early' and 'final' only if something is new
+    since its last window.
 
     With `coast`, a track that misses a detection gets an observation at its predicted box where
     the points confirm it. Such a box is in the results while it is refined, with the status
@@ -583,8 +584,15 @@ class BoxRegistrar:
         return [Observation(table, row) for row in range(len(boxes))], velocities
 
     def _end_silent_tracks(self, now_ns: int) -> None:
+        """End the tracks without a box for `max_gap`."""
         oldest_ns = now_ns - round(self.config.max_gap * 1e9)
-        self._end([name for name, track in self._tracks.items() if track.newest_ns < oldest_ns])
+        silent = [name for name, track in self._tracks.items() if track.newest_ns < oldest_ns]
+        for name in silent:
+            # Estimated again, boxes would differ from those that `flush` returns in a pause.
+            if self.config.estimate != 'track' and self._tracks[name].is_estimated:
+                self._tracks.pop(name).settle()
+            else:
+                self._end([name])
 
     def _end(self, track_ids: list[str]) -> None:
         """End tracks; they are estimated a last time with the next windows."""
@@ -649,8 +657,7 @@ class BoxRegistrar:
     def _settle_ended_tracks_beyond(self, limit: int) -> None:
         """Settle ended tracks but the first ones: none can wait."""
         for track in self._ended_tracks[limit:]:
-            for entry in track.entries:
-                entry.settle()
+            track.settle()
         del self._ended_tracks[limit:]
 
     def _solve(self, tracks: list[ObservedTrack]) -> None:

@@ -419,6 +419,18 @@ def test_a_gap_longer_than_max_gap_starts_a_new_track(estimate, no_extent_law):
 
 
 @pytest.mark.parametrize('estimate', ['early', 'final'])
+def test_boxes_that_a_pause_releases_are_those_that_later_arrays_release(estimate):
+    # Live boxes are released while no others arrive; a recording goes on at once.
+    whole = stream_of([track_of(drive(36), np.random.default_rng(0), 'a')])
+    config = config_with(estimate, max_gap=1.0)
+    known, _ = run(whole[:8] + whole[28:], config)
+    registrar = BoxRegistrar(config)
+    released = fed(registrar, whole[:8]) + registrar.flush()
+    goes_on = fed(registrar, whole[28:]) + registrar.flush()
+    assert_equal(finals(released + goes_on), finals(known))
+
+
+@pytest.mark.parametrize('estimate', ['early', 'final'])
 def test_a_new_track_of_a_known_id_has_no_prior(estimate, no_extent_law):
     # Eight boxes, a gap, then eight with the same id, in windows of six, without
     # the noise of the input. The boxes after the gap equal those of the second part alone.
