@@ -409,6 +409,7 @@ def solved(
         In their order, with as many boxes; those without boxes as they are.
 
     """
+    config = config.updated({'sampling.box_extents': 'whole'})  # a person draws whole objects
     given = [with_points(track, points, origins) for track in tracks if len(track.rows)]
     usual = keyframe_deviations(given, config)
     found = refined_tracks(given, config, person.numbers(usual))

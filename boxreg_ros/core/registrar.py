@@ -502,7 +502,7 @@ class BoxRegistrar:
                 self._tracks[track.track_id] = successor
         for (track, one), observation in zip(confirmed, seen[len(given) :], strict=True):
             track.add(one, observation)
-        if self.visible_boxes.add(track_ids, seen[: len(given)]):
+        if self.visible_boxes.add(track_ids, seen[0].table):
             for track in (*self._ended_tracks, *self._tracks.values()):
                 track.lengthen()
 

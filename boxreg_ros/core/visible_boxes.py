@@ -13,10 +13,11 @@ from collections import Counter
 from collections.abc import Sequence
 
 from boxreg_ros.config import Config
-from boxreg_ros.core.observation import GOOD_POINTS, Observation
+from boxreg_ros.core.observation import GOOD_POINTS, Observations
 from boxreg_ros.rotations import matrix_from_rpy
 from boxreg_ros.structures import BOX_CENTER, BOX_EXTENT, Floats, ROLL, Z
 import numpy as np
+from numpy.typing import NDArray
 
 # All of these are chosen, except where an origin stands beside them.
 POINT_DISTANCE = 0.1
@@ -72,7 +73,7 @@ class VisibleBoxes:
         """Return what a user should know; empty for boxes of whole objects."""
         return VISIBLE_WARNING if self.are_found else ''
 
-    def add(self, track_ids: Sequence[str], seen: Sequence[Observation]) -> bool:
+    def add(self, track_ids: Sequence[str], seen: Observations) -> bool:
         """
         Compare new boxes with their points; return whether they are visible ones from now on.
 
@@ -80,17 +81,16 @@ class VisibleBoxes:
         ----------
         track_ids : sequence of n str
             Of their tracks.
-        seen : sequence of n Observation
-            Of the boxes as they were given.
+        seen : Observations
+            Of the boxes as they were given; further ones behind them are left out.
 
         """
         if not self._is_open:
             return False
-        for track_id, observation in zip(track_ids, seen, strict=True):
-            is_visible = _ends_at_points(observation)
-            if is_visible is not None:
-                self._boxes[track_id] += 1
-                self._visible[track_id] += is_visible
+        are_compared, are_visible = _end_at_points(seen)
+        for row in np.flatnonzero(are_compared[: len(track_ids)]).tolist():
+            self._boxes[track_ids[row]] += 1
+            self._visible[track_ids[row]] += bool(are_visible[row])
         parts = [self._visible[name] >= MIN_VISIBLE * count for name, count in self._boxes.items()]
         total = self._boxes.total()
         is_known = len(parts) >= MIN_COMPARED_TRACKS and total >= MIN_BOXES_COMPARED
@@ -99,17 +99,24 @@ class VisibleBoxes:
         return self.are_found
 
 
-def _ends_at_points(seen: Observation) -> bool | None:
-    """Return whether all four sides of a box have points; None if it is small, or has few."""
-    half = seen.box[BOX_EXTENT] / 2
-    if 2 * half[:Z].max() < MIN_LENGTH:
-        return None
-    local = seen.points @ matrix_from_rpy(seen.box[ROLL:])
-    inside = local[(np.abs(local) <= half + POINT_DISTANCE).all(1), :Z]
-    if len(inside) < 2 * GOOD_POINTS:
-        return None
-    ends = np.stack([inside.max(0), -inside.min(0)])
-    return bool((np.abs(ends - half[:Z]) <= POINT_DISTANCE).all())
+def _end_at_points(seen: Observations) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which boxes are large and have enough points, and which have some on all sides."""
+    half = seen.boxes[:, BOX_EXTENT].T.astype(np.float32) / 2  # in columns: a fifth of the time
+    x, y, z = np.ascontiguousarray(seen.points.T)
+    R = matrix_from_rpy(seen.boxes[:, ROLL:]).astype(np.float32).transpose(1, 2, 0)
+    from_x, from_y, from_z = np.repeat(R, seen.counts, 2)
+    local = x * from_x + y * from_y + z * from_z
+    is_inside = (np.abs(local) <= np.repeat(half + POINT_DISTANCE, seen.counts, 1)).all(0)
+    owner = np.repeat(np.arange(len(seen.boxes)), seen.counts)
+    counts = np.bincount(owner[is_inside], minlength=len(seen.boxes))
+    rows = np.flatnonzero(counts)
+    inside, first = local[:Z, is_inside], (np.cumsum(counts) - counts)[rows]
+    ends = np.zeros((2, 2, len(counts)), np.float32)
+    ends[0][:, rows] = np.maximum.reduceat(inside, first, 1)
+    ends[1][:, rows] = -np.minimum.reduceat(inside, first, 1)
+    has_all = (np.abs(ends - half[:Z]) <= POINT_DISTANCE).all(axis=(0, 1))
+    is_large = 2 * half[:Z].max(0) >= MIN_LENGTH
+    return is_large & (counts >= 2 * GOOD_POINTS), np.asarray(has_all)
 
 
 def whole_extents(extents: Sequence[Floats], known: Floats | None) -> Floats:
