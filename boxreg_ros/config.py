@@ -31,7 +31,7 @@ YAML_ERRORS = (yaml.YAMLError, ValueError, RecursionError)
 NODE_OPTIONS = (
     *('boxes_type', 'points', 'points_type', 'time_unit', 'sensor_frames', 'points_info'),
     *('pose_reference', 'size_order', 'forward_axis', 'orientation', 'size_scale', 'boxes_frame'),
-    *('associate', 'boxes_offset'),
+    *('associate', 'boxes_offset', 'keep_ids'),
     *('clock_offset', 'fixed_frame', 'output_frame'),
     *('transform_timeout', 'deadline', 'backlog', 'static_points'),
     *('static_points_wait', 'config_file', 'input_model'),

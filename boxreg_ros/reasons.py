@@ -189,7 +189,8 @@ class Reason(StrEnum):
         'its track ids do not identify objects over time: they go from object to object, such as '
         'ids that are the row in the message, are new in each message, or are missing; the log '
         'has the figures',
-        'set `associate`, or run a tracker before this node',
+        'set `associate`, or run a tracker before this node; where a tracker would not err so '
+        'often, boxes are associated without it, unless `keep_ids` (`--keep-ids`) is set',
     )
     OBJECTS_TWICE = _reason(
         'message',

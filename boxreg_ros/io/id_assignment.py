@@ -49,8 +49,8 @@ boxes, at .003 to .038; where the three nearest objects have their row, at .075 
 have, at .52 to .77.
 
 """
-
-
+CERTAIN_JUMP_SHARE = 0.05
+"""Share of the boxes at which no tracker errs; between swaps and rows of three objects, above."""
 MIN_UNUSABLE_SHARE = 0.5
 """
 Share of the boxes without an id, or with one that no box had before.
@@ -413,6 +413,14 @@ class IdCheck:
                 count += 1
                 self._jumped.add(boxes.track_ids[row])
         return count
+
+    @property
+    def is_certain(self) -> bool:
+        """Return whether there is a finding by more boxes than those at which a tracker errs."""
+        jump = self.jumps > CERTAIN_JUMP_SHARE * self.boxes
+        are_new = self.new > MIN_UNUSABLE_SHARE * self.compared
+        are_missing = self.nameless > MIN_UNUSABLE_SHARE * self.count
+        return (jump or are_new or are_missing) and bool(self.finding)
 
     @property
     def finding(self) -> str:

@@ -49,6 +49,10 @@ SAME_FRAMES = (
     'is taken for one frame, since nothing else connects them'
 )
 ASSOCIATE = 'set associate:=true (boxreg relabel: --associate)'
+REPLACED_IDS = (
+    'boxes are associated over time instead from here on; set associate:=true to do so from the '
+    'start, or keep_ids:=true to take the ids as they are'
+)
 
 
 @dataclass(eq=False, repr=False)
@@ -80,7 +84,7 @@ class Session:
         self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
-        self.assigns_missing_ids = False  # to all boxes, while none has had an id
+        self.assigns_ids = False  # to all boxes, while none has had an id, or they jump
         self._has_ids = self._has_assigned = False
         lidars = self.placement.lidars
         self._merger: SweepMerger | None = None
@@ -136,7 +140,7 @@ class Session:
             motion = self.tree.motion(self.fixed_frame, given.frame_id, given.stamp_ns)
             moved = boxes_to_frame(given, T_fixed_item, self.fixed_frame, motion, ticket)
             self._tracker.max_gap = self.config.max_gap  # which may change
-            if self._id_check is None or self._lacks_ids(moved):
+            if self._id_check is None or self.replaces_ids or self._lacks_ids(moved):
                 moved = self._tracker.identify(moved)
             else:
                 self._id_check.add(moved)
@@ -146,7 +150,7 @@ class Session:
     def _lacks_ids(self, boxes: BoxArray) -> bool:
         """Return whether boxes are associated, since none has had an id so far."""
         self._has_ids |= any(boxes.track_ids)
-        is_assigned = self.assigns_missing_ids and not self._has_ids and bool(boxes.track_ids)
+        is_assigned = self.assigns_ids and not self._has_ids and bool(boxes.track_ids)
         self._has_assigned |= is_assigned
         return is_assigned
 
@@ -241,16 +245,22 @@ class Session:
         """Return the faults of the input, and guesses about it, that were found so far."""
         same = ', '.join(f'{a!r} and {b!r}' for a, b in sorted(self.tree.same_frames.items()))
         odometry = f'odometry: {self.tree.odometry_note}' if self._odometry_lacks_child else ''
+        remedy = REPLACED_IDS if self.replaces_ids else ASSOCIATE
         texts = [
             *((Reason.POINT_TIMES, text) for text in self.placement.normalised.values()),
             (Reason.TRANSFORM_FAULT, same and SAME_FRAMES.format(same)),
             (Reason.TRANSFORM_FAULT, self._boxes_without_frame),
             (Reason.TRANSFORM_FAULT, odometry),
             (Reason.TRACK_IDS_JUMP, BOXES_WITHOUT_IDS if self._has_assigned else ''),
-            (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {ASSOCIATE}'),
+            (Reason.TRACK_IDS_JUMP, self.jumping_ids and f'{self.jumping_ids}; {remedy}'),
         ]
         found = [Finding(reason, text) for reason, text in texts if text]
         return [*self._checks.findings(not self.jumping_ids), *found]
+
+    @property
+    def replaces_ids(self) -> bool:
+        """Return whether boxes are associated from here on, as ids identify no objects."""
+        return self.assigns_ids and self._id_check is not None and self._id_check.is_certain
 
     @property
     def jumping_ids(self) -> str:
@@ -267,7 +277,8 @@ class Session:
     @property
     def facts(self) -> dict[str, object]:
         """Return the origin of the ids, for reports."""
-        if self._id_check is not None and not self._has_assigned:
+        is_assigned = self._id_check is None or self._has_assigned or self.replaces_ids
+        if not is_assigned:
             return {'ids': 'of the input'}
         return {'ids': 'by association', 'associated_tracks': self._tracker.count}
 

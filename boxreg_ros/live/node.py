@@ -123,7 +123,7 @@ class BoxregNode(PolledClockNode):
         placement = SensorPlacement(options.lidars)
         session = Session(options.convention, config, options.fixed_frame, placement, report)
         session.tree.clock_offset = options.clock_offset
-        session.assigns_missing_ids = True  # `boxreg relabel` reads the recording once more
+        session.assigns_ids = not options.keep_ids  # `boxreg relabel` begins again
         wait = TransformWait(session, options.transform_timeout, options.output_frame)
         patience = options.static_points_wait if options.static_points else None
         self._model = ModelFile(options.input_model)

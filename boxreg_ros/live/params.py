@@ -59,6 +59,11 @@ class NodeOptions:
         'LiDARs; empty: none',
     )
     convention: Convention = STANDARD
+    keep_ids: bool = setting(
+        False,
+        'take the track ids of the input as they are, even where they do not identify objects; '
+        'by default boxes are then associated, as with associate',
+    )
     clock_offset: float = setting(
         0.0,
         'added to the stamps of TF and odometry, where their clock is behind that of the clouds',

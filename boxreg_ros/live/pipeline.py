@@ -141,10 +141,14 @@ class MessagePipeline:
         if is_placeholder(item.content):
             return self.pass_through(item.message)
         self.following.start(item.received)
+        replaced_ids = self.session.replaces_ids
         item = self.session.admit(item, Ticket(item.message, received=item.received))
         if isinstance(item.content, Sweep):
             return self._process_cloud(item)
-        return self._process_boxes(item)
+        ready = self._process_boxes(item)
+        if self.session.replaces_ids and not replaced_ids:
+            ready += self._forget_tracks()
+        return ready
 
     def pass_through(
         self, message: Any, stamp_ns: int = 0, is_early_out: bool = False
@@ -254,6 +258,13 @@ class MessagePipeline:
         ready = self.flush()
         self.registrar.reset()
         self._restart()
+        return ready
+
+    def _forget_tracks(self) -> list[Outgoing]:
+        """Forget the tracks of ids that identify no objects; return all that is held, kept."""
+        followed = self.registrar.followed  # a person's boxes, by their own ids
+        ready = self._messages(self.registrar.abandon(Reason.TRACK_IDS_JUMP))
+        self.registrar.followed = followed
         return ready
 
     def _confirmed(

@@ -58,7 +58,7 @@ def registered(drive):
         (
             (rows_as_ids, jumping_map),
             'map',
-            {'track_ids_jump': 'associate:=true', 'fixed_frame_jumps': 'fixed_frame:=odom'},
+            {'track_ids_jump': 'keep_ids:=true', 'fixed_frame_jumps': 'fixed_frame:=odom'},
         ),
         (
             (other_clock, second_robot),

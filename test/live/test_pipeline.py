@@ -193,6 +193,34 @@ def test_associated_ids_are_the_same_in_markers_and_messages(monkeypatch):
     assert live.facts['box latency'].startswith('nothing moves')
 
 
+@pytest.mark.parametrize('assigns', [True, False])
+def test_boxes_are_associated_once_ids_are_found_to_jump(assigns):
+    drive = Drive(sweeps=10)
+    for message in items_of(drive, '/boxes')[1::2]:  # ids are rows, and these have another order
+        message.detections.reverse()
+        for row, detection in enumerate(message.detections, 1):
+            detection.id = str(row)
+    live = Live()
+    live.session.assigns_ids = assigns
+    finals = [item for item in live.feed(drive) + live.flush() if item.is_final]
+    assert len(finals) == 10
+    kept = [item for item in finals if 'track_ids_jump' in item.refined.reasons]
+    assert (live.facts['ids'] == 'by association') == bool(kept) == assigns
+    words = {text.rsplit('; ')[-1] for _, text, _ in live.reports}
+    assert all('associate:=true' in text for text in words)
+    assert any('keep_ids:=true' in text for text in words) == assigns
+    if assigns:
+        assert kept == finals[2 : 2 + len(kept)]  # the first ones are out by then
+        assert all(set(item.refined.status) == {KEPT} for item in kept)
+        # From there on an id is that of one object, whatever the order in the message.
+        first, second = (
+            {item.refined.boxes.track_ids[row] for item in finals[start::2][-2:]}
+            for start, row in ((0, 0), (1, 1))
+        )
+        assert first == second and len(first) == 1
+        assert REFINED in finals[-1].refined.status
+
+
 def test_heading_signs_are_resolved_per_track_and_stay_marked_as_unknown():
     """
     One of five headings of each object is flipped, and its twist must be as well.
