@@ -214,7 +214,8 @@ class Reason(StrEnum):
     FIXED_FRAME_JUMPS = _reason(
         'message',
         'a localisation corrects the fixed frame in steps, and all boxes step with it',
-        'set `fixed_frame` to the smooth frame that the log names, `odom` by REP 105',
+        'set `fixed_frame` to the smooth frame that the log names, `odom` by REP 105; a node that '
+        'has chosen the other one goes on in it',
     )
     SENSOR_POSITION = _reason(
         'message',

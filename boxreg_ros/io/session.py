@@ -84,6 +84,9 @@ class Session:
         self.fixed_frame = self.fixed_frame.lstrip('/')
         self.sensor_frame = ''
         self.trusts_ids = False  # they are a person's: boxes at few sweeps do not show them
+        self.leaves_frames_that_jump = False  # of those it has chosen, see `fixed_frame_jumps`
+        self.left_frame = ''  # the first one
+        self._chooses_frame = not self.fixed_frame
         self.assigns_ids = False  # to all boxes, while none has had an id, or they jump
         self._has_ids = self._has_assigned = False
         lidars = self.placement.lidars
@@ -239,6 +242,17 @@ class Session:
             )
         self.fixed_frame = found
         return found
+
+    @property
+    def fixed_frame_jumps(self) -> bool:
+        """Return whether to `change_fixed_frame`: all that is held is in the one that jumps."""
+        may_change = self.leaves_frames_that_jump and self._chooses_frame
+        return may_change and bool(self._checks.smooth_frame)
+
+    def change_fixed_frame(self) -> None:
+        """Choose the frame below the fixed one that moves smoothly."""
+        self.left_frame = self.left_frame or self.fixed_frame
+        self.fixed_frame = self._checks.give_way(self.fixed_frame)
 
     @property
     def findings(self) -> list[Finding]:

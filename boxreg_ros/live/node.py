@@ -124,6 +124,7 @@ class BoxregNode(PolledClockNode):
         session = Session(options.convention, config, options.fixed_frame, placement, report)
         session.tree.clock_offset = options.clock_offset
         session.assigns_ids = not options.keep_ids  # `boxreg relabel` begins again
+        session.leaves_frames_that_jump = True  # it has searched the recording
         wait = TransformWait(session, options.transform_timeout, options.output_frame)
         patience = options.static_points_wait if options.static_points else None
         self._model = ModelFile(options.input_model)

@@ -141,11 +141,12 @@ class MessagePipeline:
         if is_placeholder(item.content):
             return self.pass_through(item.message)
         self.following.start(item.received)
+        ready = self._leave_frame() if self.session.fixed_frame_jumps else []
         replaced_ids = self.session.replaces_ids
         item = self.session.admit(item, Ticket(item.message, received=item.received))
         if isinstance(item.content, Sweep):
-            return self._process_cloud(item)
-        ready = self._process_boxes(item)
+            return ready + self._process_cloud(item)
+        ready += self._process_boxes(item)
         if self.session.replaces_ids and not replaced_ids:
             ready += self._forget_tracks()
         return ready
@@ -258,6 +259,15 @@ class MessagePipeline:
         ready = self.flush()
         self.registrar.reset()
         self._restart()
+        return ready
+
+    def _leave_frame(self) -> list[Outgoing]:
+        """Go on in a fixed frame that does not jump; return everything that is held."""
+        followed = self.registrar.followed.track_ids
+        ready = self._start_anew()
+        self.session.change_fixed_frame()
+        why = f'the fixed frame is another one: {self.session.fixed_frame!r}; follow it again'
+        self.registrar.followed.refused += [(name, why) for name in followed]
         return ready
 
     def _forget_tracks(self) -> list[Outgoing]:

@@ -16,7 +16,7 @@ from boxreg_ros.errors import UnsupportedMessage
 from boxreg_ros.io.items import Item
 from boxreg_ros.io.label_messages import LabelMessage, to_text
 from boxreg_ros.io.markers import MarkerBoard
-from boxreg_ros.io.session import is_placeholder
+from boxreg_ros.io.session import is_placeholder, refined_to_frame
 from boxreg_ros.live.budget import TickBudget
 from boxreg_ros.live.bursts import JOIN_TIME, JoiningAdapter, messages_of
 from boxreg_ros.live.debug_times import DebugTimes
@@ -345,8 +345,14 @@ class Worker:
             assert self._live.adapter is not None  # it has read the message
             refined = labels_passed_through(out.message, self._live.adapter, self._live.session)
         if refined is not None:
-            fixed_frame = self._live.session.fixed_frame
-            content = LabelMessage(refined, fixed_frame, self._live.registrar.config.digest)
+            session = self._live.session
+            frame = session.left_frame or session.fixed_frame  # the same for all labels
+            if session.left_frame:
+                boxes = refined.boxes
+                T_frame_boxes = session.tree.find(frame, boxes.frame_id, boxes.stamp_ns)
+                if T_frame_boxes is not None:
+                    refined = refined_to_frame(refined, T_frame_boxes, frame)
+            content = LabelMessage(refined, frame, self._live.registrar.config.digest)
             publisher.publish(String(data=to_text(content)))
 
     def _process(self, item: Item) -> None:

@@ -193,6 +193,27 @@ def test_associated_ids_are_the_same_in_markers_and_messages(monkeypatch):
     assert live.facts['box latency'].startswith('nothing moves')
 
 
+@pytest.mark.parametrize('given', ['', 'map'])
+def test_a_chosen_frame_that_jumps_is_left(given):
+    drive = Drive(sweeps=30)
+    for k, stamp in reversed([*enumerate(drive.stamps)]):  # as localisation: half a metre off
+        tf = drive.messages.tf(drive.messages.transform(stamp, 'map', 'odom', (k // 10 / 2, 0, 0)))
+        drive.items.insert(0, ('/tf', stamp, tf))
+    live = Live(given)
+    live.session.leaves_frames_that_jump = True
+    live.following.add(received('/boxes', items_of(drive, '/boxes')[0]))
+    finals = [item for item in live.feed(drive) + live.flush() if item.is_final]
+    assert [item.given.stamp_ns for item in finals] == drive.stamps
+    assert live.session.left_frame == ('' if given else 'map')
+    frames = [item.in_fixed.boxes.frame_id for item in finals]
+    assert frames == sorted(frames)  # map, then odom
+    assert frames[-1] == live.session.fixed_frame == (given or 'odom')
+    assert ("is 'odom' from here on, not 'map', which jumps" in str(live.reports)) != bool(given)
+    # A person is told what is not followed any more.
+    followed = live.registrar.followed
+    assert (set(followed.track_ids) == {'1', '2'}) == bool(given)
+
+
 @pytest.mark.parametrize('assigns', [True, False])
 def test_boxes_are_associated_once_ids_are_found_to_jump(assigns):
     drive = Drive(sweeps=10)

@@ -54,6 +54,15 @@ class InputChecks:
         """Return the topics of LiDARs whose clock differs from those of others and the motion."""
         return self._motion.other_clocks
 
+    @property
+    def smooth_frame(self) -> str:
+        """Return the frame that a fixed frame which jumps could give way to; empty if none."""
+        return self._motion.smooth_frame
+
+    def give_way(self, fixed_frame: str) -> str:
+        """Return the smooth frame, which is used from here on in place of one that jumps."""
+        return self._motion.give_way(fixed_frame)
+
     def restart(self) -> None:
         """Forget what a time jump parts."""
         self._pose = PoseCheck(self._convention)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from math import inf
 
 from boxreg_ros.io.transform_edge import Edge
 from boxreg_ros.io.transform_tree import TransformTree
@@ -90,13 +91,15 @@ class JumpSearch:
         """Add the samples that are new in `tree`, between both frames."""
         route = tree.route(fixed_frame, sensor_frame)
         moving = [edge for edge in route if not tree.is_constant(edge) and _moves(edge)]
+        known_ns = inf  # up to which the motion below is known: localisation may be stamped ahead
         for number, edge in enumerate(moving):
-            for row in self._new_rows(edge):
+            for row in self._new_rows(edge, known_ns):
                 if number:
                     self._add_step(tree, edge, row, sensor_frame)
                 else:
                     self._add_speed(edge, row)
                     self._add_jump(edge, row)
+            known_ns = min(known_ns, edge.stamps[-1])
 
     def smooth_frame(self, tree: TransformTree, fixed_frame: str, sensor_frame: str) -> str:
         """Return the topmost frame on the way to the sensor that no transform below it steps."""
@@ -105,13 +108,14 @@ class JumpSearch:
                 return edge.child
         return fixed_frame
 
-    def _new_rows(self, edge: Edge) -> range:
+    def _new_rows(self, edge: Edge, until_ns: float) -> range:
         """Return the rows of samples after one before them, which were not looked at."""
         key = edge.parent, edge.child
         seen_ns = self._seen_ns.get(key, -1)
-        rows = range(1 + int(np.searchsorted(edge.stamps[1:], seen_ns, 'right')), len(edge.stamps))
-        if edge.stamps:
-            self._seen_ns[key] = edge.stamps[-1]
+        first = 1 + int(np.searchsorted(edge.stamps[1:], seen_ns, 'right'))
+        rows = range(first, int(np.searchsorted(edge.stamps, until_ns, 'right')))
+        if rows:
+            self._seen_ns[key] = edge.stamps[rows[-1]]
         return rows
 
     def _add_step(self, tree: TransformTree, edge: Edge, row: int, sensor_frame: str) -> None:

@@ -91,6 +91,7 @@ class MotionCheck:
         self._clouds_ns = inf, -inf  # first and last stamp
         self._displaced: dict[tuple[str, str, str], FrameSteps] = {}  # that jump between clouds
         self.other_clocks: Set[str] = frozenset()
+        self.smooth_frame = ''  # that a fixed frame which jumps could give way to
         self.forget()
 
     def forget(self) -> None:
@@ -206,10 +207,23 @@ class MotionCheck:
             if not found[kind].text and len(self._received_ns) >= SETTLED_CLOUDS:
                 self.findings.pop(kind, None)  # an offset of the first ones that is not constant
 
+    def give_way(self, fixed_frame: str) -> str:
+        """Return the smooth frame, which is used from here on in place of one that jumps."""
+        smooth = self.smooth_frame
+        text = (
+            f'fixed frame is {smooth!r} from here on, not {fixed_frame!r}, which jumps: '
+            f'{_worst(self._jumps.steps.values())}; set fixed_frame:={fixed_frame} to refine in '
+            f'it all the same'
+        )
+        self.findings['jumps'] = Finding(Reason.FIXED_FRAME_JUMPS, text)
+        self.smooth_frame = ''
+        return smooth
+
     def _jump_text(self, fixed_frame: str, frame: str) -> str:
         smooth = self._jumps.smooth_frame(self._tree, fixed_frame, frame)
         if smooth == fixed_frame:
             return ''
+        self.smooth_frame = smooth
         return (
             f'the fixed frame {fixed_frame!r} jumps: {_worst(self._jumps.steps.values())}; '
             f'{smooth!r} moves smoothly: choose it with --fixed-frame {smooth} (node: '
