@@ -470,9 +470,17 @@ class SweepMerger:
         return self._pop(len(self._groups))
 
     def _group_for(self, sweep: Sweep) -> _Period | None:
-        """Return the oldest group that takes a cloud, a new one, or None for a late cloud."""
-        for group in self._groups:
-            if self._takes(group, sweep):
+        """
+        Return the group that takes a cloud, a new one, or None for a late cloud.
+
+        Of several it is the oldest, unless another one is nearer by more than half of the span: a
+        slow LiDAR has no cloud in some periods.
+
+        """
+        groups = [group for group in self._groups if self._takes(group, sweep)]
+        distances_ns = [abs(_first_ns(group) - sweep.stamp_ns) for group in groups]
+        for group, distance_ns in zip(groups, distances_ns, strict=True):
+            if distance_ns <= min(distances_ns) + self._span_ns // 2:
                 return group
         if self._is_late(sweep):
             return None

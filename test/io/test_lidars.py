@@ -182,6 +182,15 @@ def test_lidars_of_different_rates_are_paired_again_after_they_pass_each_other()
     assert sum(len(sweep) for sweep in sweeps) == len(order)
 
 
+def test_a_lidar_with_a_third_of_the_rate_is_merged_with_the_clouds_of_its_stamps():
+    order = [(name, 1000 + 100 * k) for k in range(10) for name in ('a', 'b')[: 1 + (k % 3 == 0)]]
+    merger = SweepMerger(('b', 'a'), 0.1, ignore)
+    sweeps = [part.sweep for item in order for part in merger.add(cloud(*item))]
+    sweeps += [part.sweep for part in merger.flush()]
+    assert [sweep.stamp_ns for sweep in sweeps] == [(1000 + 100 * k) * MS for k in range(10)]
+    assert [len(sweep.points) for sweep in sweeps] == [2 + 2 * (k % 3 == 0) for k in range(10)]
+
+
 def test_a_dropped_cloud_is_not_waited_for():
     merger = SweepMerger(('a', 'b'), 0.1, ignore)
     merger.add(cloud('a', 1000, is_dropped=True))
