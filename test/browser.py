@@ -55,13 +55,16 @@ def end_shared_browser():
 
 
 @contextmanager
-def serving(server):
-    """Run a server in a thread; yield it, and end it afterwards."""
-    Thread(target=server.serve_forever, daemon=True).start()
+def serving(server, joins=False):
+    """Run a server in a thread; yield it, and end it afterwards; with `joins`, wait for that."""
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
     try:
         yield server
     finally:
         server.shutdown()
+        if joins:
+            thread.join()
 
 
 @contextmanager
