@@ -392,7 +392,8 @@ def points_around(points: NDArray[np.floating], center: Floats, reach: float) ->
 
 def _is_inside(points: NDArray[np.floating], boxes: Floats) -> NDArray[np.bool_]:
     """Return which points are in each of n boxes, a margin around it included, (n, points)."""
-    R = matrix_from_rpy(boxes[:, ROLL:])
-    local = (points - boxes[:, None, BOX_CENTER]) @ R  # (n, points, 3)
-    limit = boxes[:, None, BOX_EXTENT] / 2 + POINT_MARGIN
-    return np.asarray((np.abs(local) <= limit).all(axis=2))
+    axes = matrix_from_rpy(boxes[:, ROLL:]).transpose(2, 0, 1)  # (3, n, 3)
+    offsets = (axes * boxes[:, BOX_CENTER]).sum(axis=2)
+    limits = boxes[:, BOX_EXTENT].T / 2 + POINT_MARGIN  # (3, n)
+    local = axes @ points.T - offsets[..., None]  # (3, n, points)
+    return np.asarray((np.abs(local) <= limits[..., None]).all(axis=0))
