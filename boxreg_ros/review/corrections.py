@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 SAME_SWEEP_NS = 50_000_000
 """Boxes are of a sweep if its stamp is nearer than this [ns]; chosen: half a revolution."""
-WITHOUT_EFFECT = ('accept', 'unsure', 'none')
 STATED = ('reclass', 'attribute')
 """Kinds whose values the boxes of a result state, but not whether a person gave them."""
 
@@ -74,7 +73,7 @@ class Corrections:
         self._of_track = _by_track(held([*others, *decisions]))
         self._earlier = _by_track(one for one in earlier if one.kind in STATED)
         self._decided = [one for one in held(decisions) if not one.is_taken_back]
-        self._unused = {one.scope for one in self._decided if one.kind not in WITHOUT_EFFECT}
+        self._unused = {one.scope for one in self._decided}
         self._unseen = {one.track_id for one in earlier}
         self._ranges = _by_track(one for one in self._decided if one.end_ns is not None)
         self._doubts: set[str] = set()  # see `doubts`
@@ -224,6 +223,11 @@ class Corrections:
         earlier = self._stated_earlier(input_id, stamp_ns).get('class')
         decided = self._value('class', input_id, stamp_ns)
         return decided or known or (earlier.value if earlier else '')
+
+    def has_own_class(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether a class was given to the box, and not with its whole track."""
+        of_track = self.class_name(input_id, MAX_STAMP_NS + 1)  # of no box
+        return self.class_name(input_id, stamp_ns) not in ('', of_track)
 
     def _stated_earlier(self, track_id: str, stamp_ns: int) -> dict[str, Decision]:
         """Return what an earlier run has given to a box, or would have, by topic."""

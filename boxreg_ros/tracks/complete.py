@@ -341,8 +341,7 @@ class _Completer:
         own = self._of_track.get(track.track_id)
         for (index, row), stamp_ns in zip(track.places, track.stamps_ns.tolist(), strict=True):
             array = self._plan.arrays[index]
-            decided = '' if own is None else own.class_name(stamp_ns)
-            class_name = decided or track.class_name
+            class_name = track.class_name if own is None else own.class_name(stamp_ns)
             steps.reclassified += array.class_names[row] != class_name
             array.track_ids[row] = track.track_id
             array.class_names[row] = class_name
@@ -359,7 +358,7 @@ class _Completer:
             self._plan.arrays[self._array_of[stamp_ns]].added.append(
                 AddedBox(
                     track.track_id,
-                    own.class_name(stamp_ns) or track.class_name,
+                    own.class_name(stamp_ns),
                     boxes.status if pin is None else HUMAN,
                     boxes.boxes[i] if pin is None else pin,
                     boxes.covariances[i],

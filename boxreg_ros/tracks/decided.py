@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -43,6 +44,10 @@ class Decided(Protocol):
         """Return the class that was given; empty for none."""
         return ''
 
+    def has_own_class(self, input_id: str, stamp_ns: int) -> bool:
+        """Return whether a class was given to the box, and not with its whole track."""
+        return False
+
     def pause(self, track_id: str) -> float:
         """Return how long the ranges are whose boxes a person has deleted, together [s]."""
         return 0.0
@@ -81,15 +86,28 @@ class DecidedTrack:
     stamps_ns: tuple[int, ...]  # of its boxes of the input, ascending
     input_ids: tuple[str, ...]  # of these
     decided: Decided
+    other_class: str  # of the boxes whose class no person has decided
 
     @classmethod
     def of(cls, tracklet: Tracklet, given: Sequence[BoxArray], decided: Decided) -> DecidedTrack:
-        """Return the decisions about a tracklet of some arrays, as they were registered."""
+        """
+        Return the decisions about a tracklet of some arrays, as they were registered.
+
+        A class given to some boxes of a track is of these alone: it has no vote on the others.
+
+        """
         stamps_ns = tuple(tracklet.stamps_ns.tolist())
-        names = [given[index].track_ids[row] for index, row in tracklet.places]
-        pairs = zip(names, stamps_ns, strict=True)
-        input_ids = tuple(decided.input_id(*pair) for pair in pairs)
-        return cls(tracklet.track_id, stamps_ns, input_ids, decided)
+        arrays = [given[index] for index, _ in tracklet.places]
+        rows = [row for _, row in tracklet.places]
+        names = [array.track_ids[row] for array, row in zip(arrays, rows, strict=True)]
+        input_ids = tuple(map(decided.input_id, names, stamps_ns))
+        is_own = [*map(decided.has_own_class, input_ids, stamps_ns)]
+        class_name = tracklet.class_name
+        if any(is_own) and not all(is_own):
+            free = (i for i, own in enumerate(is_own) if not own)
+            votes = Counter(arrays[i].class_names[rows[i]] for i in free)
+            class_name = votes.most_common(1)[0][0]
+        return cls(tracklet.track_id, stamps_ns, input_ids, decided, class_name)
 
     @classmethod
     def of_followed(cls, track: FollowedTrack, decided: Decided) -> DecidedTrack:
@@ -97,7 +115,7 @@ class DecidedTrack:
         pairs = zip(track.stamps_ns.tolist(), track.status, strict=True)
         stamps_ns = tuple(stamp_ns for stamp_ns, word in pairs if word == HUMAN)
         input_ids = tuple(decided.input_id(track.track_id, stamp) for stamp in stamps_ns)
-        return cls(track.track_id, stamps_ns, input_ids, decided)
+        return cls(track.track_id, stamps_ns, input_ids, decided, track.class_name)
 
     def input_id(self, stamp_ns: int) -> str:
         """Return the id that names a box at a stamp."""
@@ -105,8 +123,8 @@ class DecidedTrack:
         return self.input_ids[max(row, 0)]
 
     def class_name(self, stamp_ns: int) -> str:
-        """Return the class that was given to the box at a stamp; empty for none."""
-        return self.decided.class_name(self.input_id(stamp_ns), stamp_ns)
+        """Return the class of the box at a stamp: that given to it, else that of the others."""
+        return self.decided.class_name(self.input_id(stamp_ns), stamp_ns) or self.other_class
 
     def pin(self, stamp_ns: int) -> Floats | None:
         """Return the box that a person has set at a stamp; None for none."""

@@ -86,8 +86,7 @@ def followed_plan(
                 # It is beside the stamp of its sweep, which has a box of its own.
                 is_between = stamps[seeds].min() < stamp_ns < stamps[seeds].max()
                 word = INTERPOLATED if is_between else EXTENDED
-            class_name = own.class_name(int(stamp_ns)) if own.stamps_ns else ''
-            class_name = class_name or track.class_name
+            class_name = own.class_name(int(stamp_ns)) if own.stamps_ns else track.class_name
             array.added.append(AddedBox(track.track_id, class_name, word, box, UNSUPPORTED, 1.0))
     return plan
 

@@ -133,7 +133,8 @@ def tracklets_of(
     config : Config
         `max_gap` [s], and the settings of the kinds of objects.
     names : collection of str
-        Ids that are of one object each, and split only where they have two boxes at one stamp.
+        Ids that are of one object each, and never split: of two boxes at one stamp only the first
+        is in the tracklet.
     pause : callable
         Returns by how much `max_gap` is longer for an id [s].
 
@@ -169,7 +170,7 @@ def tracklets_of(
         max_gap = inf if track_id in names else config.max_gap + pause(track_id)
         parts = _split(every, rows, max_gap)
         parts.sort(key=len, reverse=True)  # stable: of equal ones the first keeps the id
-        for part in parts:
+        for part in parts[:1] if track_id in names else parts:
             name = track_id if part is parts[0] else unused_id(track_id, taken)
             class_name = Counter(class_names[row] for row in part).most_common(1)[0][0]
             tracklet = replace(every.take(part), track_id=name, class_name=class_name)

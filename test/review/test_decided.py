@@ -664,6 +664,20 @@ def test_tracks_with_boxes_at_the_same_stamps_are_joined(completed, tmp_path, ca
     classes = [one for one in read_decisions(tmp_path / 'out' / APPLIED) if one.kind == 'reclass']
     spans = [(one.stamp_ns, one.end_ns) for one in classes]
     assert all(any(a <= stamps[k] <= b for a, b in spans) for k in (2, 3, 4))
+    # Complete tracks have them, too: both boxes keep the id that a person gave.
+    rows = Run(out.with_name('drive'), '--complete')(tmp_path / 'whole', decisions[:1])
+    assert {name for name, _ in rows} == {'2', '9'}
+    written = rows_in(tmp_path / 'whole' / 'boxes.csv')
+    count = sum((row['track_id'], row['stamp_ns']) == ('2', str(stamps[0])) for row in written)
+    assert count == 2
+
+
+def test_a_class_given_to_most_boxes_of_a_track_is_of_these_alone(completed, tmp_path):
+    run, stamps, _, _ = completed
+    boxes = Decision('2', stamps[2], 'reclass', end_ns=stamps[-1], value='truck')
+    rows = run(tmp_path / 'out', [boxes])
+    classes = [rows['2', stamp]['class_name'] for stamp in stamps]
+    assert classes == ['car'] * 2 + ['truck'] * (SWEEPS - 2)
 
 
 def test_a_box_of_a_person_keeps_its_class(completed, tmp_path):

@@ -112,6 +112,27 @@ def test_undo_and_redo_outlast_a_reload_and_leave_what_others_decided(out, serve
     assert [one.kind for one in read_decisions(out / DECISIONS)][-2:] == ['accept', 'restore']
 
 
+def test_undo_of_a_restored_track_leaves_the_pin_of_another_person(out, serve):
+    gone = "isGone(TRACKS.find(t => t.id === '1'))"
+    with serve() as server, opened_page(server.address + '#track=1') as page:
+        DecisionLog(out / DECISIONS).append([Decision('1', None, 'delete', who='ben', when='1')])
+        page.wait_for_function(gone)
+        press(page, 'd', f'!{gone}')
+        press(page, 'z', gone)
+        press(page, 'y', f'!{gone}')
+        stamp_ns, box = page.evaluate(
+            '[stampOf(...boxAt(3)), moved(view.part.usable[3], view.part.origin, 1)]'
+        )
+        pin = Decision('1', int(stamp_ns), 'pin', '', 'odom', np.array(box), who='ben', when='2')
+        DecisionLog(out / DECISIONS).append([pin])
+        page.wait_for_function('pinOf(3)')
+        page.keyboard.press('z')
+        page.wait_for_selector('#failure:not([hidden])')
+        assert 'ben has decided about track 1 since (pin)' in page.inner_text('#failure')
+        assert not page.evaluate(gone)
+    assert read_decisions(out / DECISIONS)[-1].kind == 'pin'
+
+
 def test_enter_after_a_click_or_on_a_tab_accepts(serve):
     with serve() as server, opened_page(server.address + '#tracks') as page:
         second = page.evaluate('TRACKS[1].id')

@@ -273,6 +273,8 @@ def test_last_decision_holds_and_box_goes_before_track():
         Decision('3', None, 'reject'),
         Decision('3', None, 'none'),
         Decision('4', None, 'reject'),
+        Decision('5', None, 'accept'),
+        Decision('3', 4, 'unsure'),
         Decision('2', 6, 'reject'),
     ])  # fmt: skip
     pinned = corrections.to_register(given)
@@ -285,7 +287,7 @@ def test_last_decision_holds_and_box_goes_before_track():
     for stamp_ns in (5, 9):
         at = replace(given, stamp_ns=stamp_ns)
         corrections.with_attributes(at, corrections.apply(at, replace(refined, boxes=at)))
-    assert corrections.unused() == ["'2' at 6", "'4'"]
+    assert corrections.unused() == ["'2' at 6", "'3' at 4", "'4'", "'5'"]
     later = Corrections(earlier=corrections.applied())  # on the result: gaps are rejected as well
     assert [later.is_left_out(name, 7) for name in '123'] == [True, True, False]
     assert not later.is_left_out('1', 5)

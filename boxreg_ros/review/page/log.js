@@ -46,6 +46,13 @@ function forget() {
   log.count = log.rows.length = log.made.length = log.undone.length = 0;
 }
 
+// A box that was set after a deletion was taken back: deleted again, it would be gone.
+function boxSetSince(row) {
+  if (row.decision !== 'delete') return undefined;
+  const rows = log.rows.slice(log.rows.findLastIndex(one => keyOf(one) === keyOf(row)) + 1);
+  return rows.find(one => one.box && one.track_id === row.track_id && covers(row, one.stamp_ns) && log.held.get(keyOf(one)) === one);
+}
+
 // Undo and redo are about the decisions of another person from now on.
 function setPerson(who) {
   const rows = [...log.rows];
@@ -124,7 +131,8 @@ function takeStep(next, wanted, now, nothing, word) {
     const found = next();
     if (!found) return say(nothing);
     if (isCorrecting()) return;
-    const other = found[now].map(row => log.held.get(keyOf(row)) ?? takenBack(row)).find((row, k) => !isSameRow(row, found[now][k]));
+    const other = found[now].map(row => log.held.get(keyOf(row)) ?? takenBack(row)).find((row, k) => !isSameRow(row, found[now][k]))
+      ?? found[wanted].map(boxSetSince).find(Boolean);
     if (other) return fail(`${other.who || 'Another person'} has decided about track ${other.track_id} since (${other.decision}): nothing was changed. Decide about it anew.`);
     if (!await decide(found[wanted])) return;
     const [{ decision, value, track_id: id }] = found.after;
